@@ -41,6 +41,7 @@ from surgical_marl.view.drawn import Extra
 from surgical_marl.view.lighting import PLAIN
 from surgical_marl.view.render import Renderer, View
 from surgical_marl.view.shading import CLOTH, Material, named
+from surgical_marl.view.skin import skins
 from surgical_marl.view.stage import paint, stage
 from surgical_marl.view.tracer import PLANE
 
@@ -60,7 +61,8 @@ OBJECT_AZIMUTH, OBJECT_ELEVATION = 240.0, -35.0
 
 def scene_picture(scene: Scene) -> Picture:
     """Draw the scene with its arms at home, [height, width, 3] uint8."""
-    return Renderer(scene.model, *SMALL, stage(scene), paint(scene)).render(_at_home(scene), best_view(scene))
+    own = skins(scene.systems, scene.model)
+    return Renderer(scene.model, *SMALL, stage(scene), paint(scene), own).render(_at_home(scene), best_view(scene))
 
 
 def arm_picture(name: str, folder: Path) -> Picture:
@@ -80,7 +82,8 @@ def object_picture(name: str) -> Picture:
     """Draw one object on a white ground."""
     spec = mujoco.MjSpec()
     placed = {name: Placement(load_object(name), np.zeros(3), np.eye(3))}
-    add_bars(spec, soft_systems(placed, {name: PlacementEntry(name)}, Place(), {name: {}}))
+    systems = soft_systems(placed, {name: PlacementEntry(name)}, Place(), {name: {}})
+    add_bars(spec, systems)
     if not placed[name].object.soft:
         add_objects(spec, placed)
     model = spec.compile()
@@ -90,7 +93,7 @@ def object_picture(name: str) -> Picture:
     white = Material(np.array([0.72, 0.74, 0.76]), CLOTH, int(PLAIN))
     ground = Extra(int(PLANE), (0.0, 0.0, 0.0), np.array([0.0, 0.0, lowest]), np.eye(3), white)
     view = View(model.stat.center.tolist(), 1.5 * model.stat.extent, OBJECT_AZIMUTH, OBJECT_ELEVATION)
-    return Renderer(model, *SMALL, [ground], named(model, placed)).render(data, view)
+    return Renderer(model, *SMALL, [ground], named(model, placed), skins(systems, model)).render(data, view)
 
 
 def clip(task: str, path: Path) -> str:

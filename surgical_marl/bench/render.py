@@ -23,6 +23,7 @@ from surgical_marl.scenes.scene import Scene
 from surgical_marl.view.camera import best_view
 from surgical_marl.view.record import HEIGHT, WIDTH
 from surgical_marl.view.render import Renderer
+from surgical_marl.view.skin import skins
 from surgical_marl.view.stage import paint, stage
 from surgical_marl.vision.endoscope import SIZE, Endoscope
 from surgical_marl.vision.raycaster import GROUPS
@@ -98,7 +99,10 @@ def measure_pictures(
     data = mujoco.MjData(drawn.model)
     data.qpos[:] = drawn.home
     mujoco.mj_forward(drawn.model, data)
-    renderer, view = Renderer(drawn.model, *size, stage(drawn), paint(drawn)), best_view(drawn)
+    renderer, view = (
+        Renderer(drawn.model, *size, stage(drawn), paint(drawn), skins(drawn.systems, drawn.model)),
+        best_view(drawn),
+    )
     timer = clock.cpu_clock(lambda: renderer.render(data, view), now=time.thread_time)
     took = clock.race({"picture": timer}, seconds, repeats)["picture"]
     return Pictures(1e3 * took, *size, int((drawn.model.geom_group < GROUPS).sum()))

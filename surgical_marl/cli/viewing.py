@@ -38,7 +38,7 @@ def add_view(commands: Any) -> None:
 
 def add_play(commands: Any) -> None:
     """Add the command play."""
-    parser = commands.add_parser("play", help="a film of a policy, from outside and from the endoscope")
+    parser = commands.add_parser("play", help="a film of a policy, from outside, from near and from the endoscope")
     _add_what(parser)
     parser.add_argument("--out", type=user_path, required=True, metavar="FILE", help="an .mp4, a .gif or a .webp")
     parser.add_argument("--episodes", type=whole(1, 1000), default=1, metavar="N")
@@ -47,9 +47,9 @@ def add_play(commands: Any) -> None:
     parser.add_argument("--slow", type=_number, default=1.0, metavar="X", help="times slower than real time")
     what = "a camera of the scene by name, or AZIMUTH,ELEVATION,DISTANCE in degrees and m about the tool tips"
     parser.add_argument("--camera", metavar="CAMERA", help=what)
-    what = "pixels of the picture of one environment (default: 480x360, and less in a grid)"
+    what = "pixels of the film, or of each picture in a grid (default: 1280x720, and less in a grid)"
     parser.add_argument("--size", type=_pair("width and height in pixels such as 640x480"), metavar="WxH", help=what)
-    parser.add_argument("--plain", action="store_true", help="without words in the picture")
+    parser.add_argument("--plain", action="store_true", help="without words")
     parser.set_defaults(check=_check_play, command=_play, name="play")
 
 

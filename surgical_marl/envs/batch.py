@@ -315,6 +315,12 @@ class BatchedEnv:
         return Poses(found.origin, np.array(found.quaternion))
 
     @property
+    def drawn_nodes(self) -> dict[str, np.ndarray]:
+        """Nodes of thread and tissue by name, [N, n, 3] each, m, numpy."""
+        self._part(".steps", "numpy")
+        return self._free_objects.read_nodes(self.engine)
+
+    @property
     def held(self) -> np.ndarray:
         """Which arms hold which free objects, [N, k, arms] bool, numpy, in the order of `object_poses` and `agents`."""
         self._part(".steps", "numpy")

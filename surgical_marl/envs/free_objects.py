@@ -50,8 +50,8 @@ class FreeObjects:
     def read_drawn(self, engine: Engine, num_envs: int, library: str = "numpy", place: str = "") -> Poses:
         """Return the poses of all that moves but arms, as `read`: free objects, then the bars of systems."""
         found = [self.read(engine, num_envs, library, place)] if self.count or not self._bars else []
-        for name, bars in self._bars.items():
-            nodes = engine.read(f"{place}.physics.{name}.{bars.state}", library)
+        for name, nodes in self.read_nodes(engine, library, place).items():
+            bars = self._bars[name]
             found.append(Poses(*along(*(nodes[:, bars.ends[:, side]].mean(2) for side in (0, 1)))))
         if len(found) == 1:
             return found[0]
@@ -61,6 +61,10 @@ class FreeObjects:
 
             joined = torch.cat
         return Poses(*(joined([getattr(own, field) for own in found], 1) for field in ("origin", "quaternion")))
+
+    def read_nodes(self, engine: Engine, library: str = "numpy", place: str = "") -> dict[str, Any]:
+        """Return where the nodes of systems are that pictures show, [N, n, 3] each, m, by name; arguments as `read`."""
+        return {name: engine.read(f"{place}.physics.{name}.{bars.state}", library) for name, bars in self._bars.items()}
 
     def read(self, engine: Engine, num_envs: int, library: str = "numpy", place: str = "") -> Poses:
         """Return poses in arrays of "numpy" or "torch".

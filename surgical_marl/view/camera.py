@@ -16,8 +16,10 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from surgical_marl.robots.spec import VISUAL_GROUP
 from surgical_marl.scenes.scene import Scene
 from surgical_marl.view.render import View
+from surgical_marl.view.skin import skins
 
 if TYPE_CHECKING:
     from surgical_marl.tasks.base.task import Task
@@ -33,10 +35,12 @@ _AROUND = 0.03
 """Distance from the point in front of an arm within which its targets are looked for, m."""
 _SLACK = 0.012
 """A point counts as seen if a ray ends at most so far in front of it, m: it may lie within a tool."""
-_FILLED, _LEAST = 0.75, 0.5
+_FILLED, _LEAST = 0.8, 0.25
 """Part of the picture that the points fill; least distance, over that of the scene's own camera."""
 _TABLES = {"points": 3, "starts": 7}
 """Tables of a task that hold places in the world, and how many numbers a row has."""
+_STEEP, _NEAREST = -40.0, 0.02
+"""Elevation of a view from near at most, degrees, and half of the height that it shows at least, m."""
 _PLACES = 16
 """Rows of a task's tables that are looked at, about."""
 _TURNED, _CLOSE = 0.25, 0.5
@@ -51,21 +55,56 @@ class _Moment(NamedTuple):
     points: Array
 
 
-def best_view(scene: Scene, places: Array | None = None, aspect: float = 4 / 3) -> View:
+def best_view(scene: Scene, places: Array | None = None, aspect: float = 4 / 3, whole: bool = False) -> View:
     """Return the view of a scene in which the least is hidden.
 
     Args:
         scene: what is looked at.
         places: further points in the world that should be seen, [P, 3], m.
         aspect: width over height of the picture.
+        whole: hold all of the arms too, from farther away.
     """
     moments = _moments(scene, np.zeros((0, 3)) if places is None else places)
-    points = np.concatenate([moment.points for moment in moments])
+    points = moments[0].points
     middle = (points.min(0) + points.max(0)) / 2
     own = moments[0].data.camera("overview").xpos - middle
+    least = _LEAST * float(np.linalg.norm(own))
+    if whole:
+        parts = _parts(scene.model, moments[0].data)
+        own = middle - parts.mean(0)  # from across the arms
+        points = np.concatenate([points, parts])
+        middle = (points.min(0) + points.max(0)) / 2
     ways = [(azimuth, elevation) for elevation in _ELEVATIONS for azimuth in _AZIMUTHS]
-    views = [_fitted(points, middle, _LEAST * float(np.linalg.norm(own)), aspect, *way) for way in ways]
+    views = [_fitted(points, middle, least, aspect, *way) for way in ways]
     return max(views, key=lambda view: _score(scene, moments, view, own))
+
+
+class Focus:
+    """A view from near that follows what a scene is about.
+
+    That is the needle that a thread is tied to, else the only free object, else tissue, else the tool tips.
+
+    Args:
+        scene: what is looked at.
+        view: from which side.
+    """
+
+    def __init__(self, scene: Scene, view: View) -> None:
+        self._view = replace(view, elevation=min(view.elevation, _STEEP), fovy=_FOVY)
+        model = scene.model
+        needles = [tie.body for system in scene.systems.values() for tie in system.ties if tie.body]
+        only = list(scene.free_objects) if len(scene.free_objects) == 1 else []
+        names = (needles or only or [skin.name for skin in skins(scene.systems, model)])[:1]
+        owners = [model.body(int(body)).name.partition("/")[0] for body in model.geom_bodyid]
+        self._geoms = [geom for geom, owner in enumerate(owners) if owner in names]
+        self._tips = [model.site(f"{agent}/tool_tip").id for agent in scene.agents]
+
+    def __call__(self, data: mujoco.MjData) -> View:
+        """Return the view at a pose, after `mj_kinematics`."""
+        points = data.geom_xpos[self._geoms] if self._geoms else data.site_xpos[self._tips]
+        middle = (points.min(0) + points.max(0)) / 2
+        half = max(_NEAREST, 0.7 * float(np.ptp(points, axis=0).max()))
+        return replace(self._view, lookat=tuple(middle.tolist()), distance=half / np.tan(np.radians(_FOVY / 2)))
 
 
 def task_places(task: Task) -> Array:
@@ -133,6 +172,15 @@ def _moments(scene: Scene, places: Array) -> list[_Moment]:
         tips = [data.site(f"{agent}/tool_tip").xpos for agent in scene.agents]
         found.append(_Moment(data, np.array([*tips, *still])))
     return found
+
+
+def _parts(model: mujoco.MjModel, data: mujoco.MjData) -> Array:
+    """Return the corners of boxes about all visible parts of arms, [P, 3], m."""
+    parts = np.flatnonzero(model.geom_group == VISUAL_GROUP)
+    corners = np.stack(np.meshgrid(*3 * [[-1.0, 1.0]]), -1).reshape(-1, 3)
+    local = model.geom_aabb[parts, None, :3] + corners * model.geom_aabb[parts, None, 3:]
+    turned = np.einsum("gij,gcj->gci", data.geom_xmat[parts].reshape(-1, 3, 3), local)
+    return (turned + data.geom_xpos[parts, None]).reshape(-1, 3)
 
 
 def _hits(model: mujoco.MjModel, data: mujoco.MjData, eye: Array, rays: Array) -> Array:

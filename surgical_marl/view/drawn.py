@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from surgical_marl.view.lighting import GLOW, GRAIN
 from surgical_marl.view.shading import GAMMA, PLASTIC, Material, materials, visual_rgba
+from surgical_marl.view.skin import Skin
 from surgical_marl.view.tracer import PLANE, Shape, World, wp
 from surgical_marl.vision.raycaster import GROUPS, KINDS, corner_normals, warp_mesh
 from surgical_marl.vision.rays import CAPSULE, CYLINDER, ELLIPSOID, FAR, MESH
@@ -25,7 +26,7 @@ Sphere = tuple[Sequence[float], float, Sequence[float]]
 # Made once, because NumPy parses its text as Python code each time, which two threads cannot do at the same time in
 # Python 3.11.
 _LAYOUT: Any = np.dtype(Shape.numpy_dtype())  # type: ignore[attr-defined]  # a struct of Warp
-_LINE = 0.6
+_LINE = 1.0
 """Radius of a capsule in the picture at least, pixels."""
 _KINDS = {mujoco.mjtGeom.mjGEOM_PLANE: PLANE, **KINDS}
 
@@ -45,6 +46,14 @@ class Extra(NamedTuple):
     """True if it throws a shadow."""
 
 
+class Placed(NamedTuple):
+    """A `World` of a pose, without eyes, and what it is made of, to be kept as long as it is."""
+
+    world: Any
+    shapes: NDArray[np.void]
+    meshes: list[Any]
+
+
 class Drawn:
     """Shapes of one model.
 
@@ -52,6 +61,7 @@ class Drawn:
         model: whose geoms are primitives or meshes; of other kinds nothing is seen.
         stage: shapes besides those of the model.
         paint: geom -> what it is made of, or the rgb that suggests it, in place of its own colour.
+        skins: surfaces that are drawn in place of some geoms.
     """
 
     def __init__(
@@ -59,24 +69,31 @@ class Drawn:
         model: mujoco.MjModel,
         stage: Sequence[Extra] = (),
         paint: Mapping[int, Material | Sequence[float]] = MappingProxyType({}),
+        skins: Sequence[Skin] = (),
     ) -> None:
         seen = (model.geom_group < GROUPS) & (visual_rgba(model)[:, 3] > 0)
+        for skin in skins:
+            seen[skin.geoms] = False
         known = np.array([mujoco.mjtGeom(kind) in _KINDS for kind in model.geom_type], bool)
         self._geoms = geoms = np.flatnonzero(seen & known)
         kinds = [int(_KINDS[mujoco.mjtGeom(kind)]) for kind in model.geom_type[geoms]]
         sizes = [_size(model, geom) for geom in geoms.tolist()]
-        shapes = np.zeros(len(kinds) + len(stage), _LAYOUT)
-        shapes["kind"] = [*kinds, *(extra.kind for extra in stage)]
-        shapes["size"] = np.array([*sizes, *(extra.size for extra in stage)]).reshape(-1, 3)
+        self._skins = list(skins)
+        shapes = np.zeros(len(kinds) + len(stage) + len(skins), _LAYOUT)
+        shapes["kind"] = [*kinds, *(extra.kind for extra in stage), *(int(MESH) for _ in skins)]
+        shapes["size"] = np.array([*sizes, *(extra.size for extra in stage), *np.ones((len(skins), 3))]).reshape(-1, 3)
         shapes["radius"] = np.where(shapes["kind"] == PLANE, float(FAR), np.linalg.norm(_halves(shapes), axis=1))
         shapes["shadow_kind"], shapes["shadow_size"] = _shadows(shapes["kind"], shapes["size"])
         shapes["breadth"], shapes["alpha"] = _breadths(shapes["shadow_size"]), 1.0
         made = materials(model, paint)
-        for row, of in zip(
-            shapes, [*(made[geom] for geom in geoms), *(extra.material for extra in stage)], strict=True
-        ):
+        looks = [
+            *(made[geom] for geom in geoms),
+            *(extra.material for extra in stage),
+            *(skin.material for skin in skins),
+        ]
+        for row, of in zip(shapes, looks, strict=True):
             row["colour"], row["gloss"], row["pattern"] = of
-        for row, extra in zip(shapes[len(geoms) :], stage, strict=True):
+        for row, extra in zip(shapes[len(geoms) :], stage, strict=False):
             row["place"], row["back"] = extra.place, extra.axes.T
             row["shadow_kind"] = row["shadow_kind"] if extra.casts else -1
         with wp.ScopedDevice("cpu"):
@@ -89,7 +106,8 @@ class Drawn:
                 row["mesh"], row["first_face"] = self._meshes[mesh].id, model.mesh_faceadr[mesh]
         self._shapes = shapes
         self._grain = wp.array(_grain(), dtype=wp.vec4, device="cpu")
-        self._face_normals = wp.array(corner_normals(model), dtype=wp.vec3, device="cpu")
+        self._normals = corner_normals(model)
+        self._face_normals = wp.array(self._normals, dtype=wp.vec3, device="cpu")
         self._fade = 3.2 * float(model.stat.extent)
 
     @property
@@ -98,15 +116,21 @@ class Drawn:
         return len(self._shapes)
 
     def at(
-        self, data: mujoco.MjData, eye: Array, pixel: float, spheres: Sequence[Sphere], through: float
-    ) -> tuple[Any, NDArray[np.void]]:
-        """Return a `World` of a pose, without eyes, and its shapes, to be kept as long as the world is.
+        self,
+        data: mujoco.MjData,
+        eye: Array,
+        pixel: float,
+        spheres: Sequence[Sphere],
+        through: float,
+        nodes: Sequence[Array] | None = None,
+    ) -> Placed:
+        """Return a world of a pose.
 
         Args:
             data: poses of the model's geoms.
             eye: where it is seen from, m.
             pixel: width of a pixel at distance 1.
-            spheres, through: as `Renderer.render` has them.
+            spheres, through, nodes: as `Renderer.render` has them.
         """
         centres = np.array([centre for centre, _, _ in spheres], float).reshape(-1, 3)
         farthest = np.argsort(-np.linalg.norm(centres - eye, axis=1), kind="stable")
@@ -120,6 +144,7 @@ class Drawn:
         for row, (centre, radius, rgba) in zip(more, (spheres[ball] for ball in farthest), strict=True):
             row["place"], row["size"], row["shadow_size"], row["radius"] = centre, radius, radius, radius
             row["breadth"], row["colour"], row["alpha"] = radius, np.array(rgba[:3]) ** GAMMA, rgba[3]
+        meshes, face_normals = self._deform(still, nodes or [skin.rest for skin in self._skins])
         towards = eye - shapes["place"]
         shapes["viewer"] = np.einsum("nij,nj->ni", shapes["back"], towards)
         shapes["near"] = np.linalg.norm(towards, axis=1) - shapes["radius"]
@@ -132,8 +157,28 @@ class Drawn:
         # By its address, because Warp would make the layout anew to compare it.
         world.shapes = wp.array(ptr=shapes.ctypes.data, dtype=Shape, shape=shapes.shape, device="cpu")
         world.balls, world.through, world.fade = self.count, through, self._fade
-        world.grain, world.face_normals = self._grain, self._face_normals
-        return world, shapes
+        world.grain, world.face_normals = self._grain, face_normals
+        return Placed(world, shapes, meshes)
+
+    def _deform(self, shapes: NDArray[np.void], nodes: Sequence[Array]) -> tuple[list[Any], Any]:
+        """Set the shapes of skins, the last ones, for these nodes; return their meshes, and the normals of all faces.
+
+        A skin's frame stands where it is at rest, so that its pattern stays there.
+        """
+        if not self._skins:
+            return [], self._face_normals
+        meshes, normals = [], [self._normals]
+        for row, skin, points in zip(shapes[-len(self._skins) :], self._skins, nodes, strict=True):
+            middle = skin.rest.mean(0)
+            local = np.asarray(points, float) - middle
+            row["place"], row["back"], row["size"] = middle, np.eye(3), np.abs(local).max(0)
+            row["radius"] = np.linalg.norm(row["size"])
+            row["first_face"] = sum(map(len, normals))
+            normals.append(skin.normals(local))
+            with wp.ScopedDevice("cpu"):
+                meshes.append(wp.Mesh(wp.array(local, dtype=wp.vec3), wp.array(skin.triangles.ravel(), dtype=int)))
+            row["mesh"] = meshes[-1].id
+        return meshes, wp.array(np.concatenate(normals), dtype=wp.vec3, device="cpu")
 
 
 def _size(model: mujoco.MjModel, geom: int) -> Array:

@@ -1,4 +1,4 @@
-"""Films of a policy for `surgical-marl play`: from outside and from the endoscope, with errors and stages in words.
+"""Films of a policy for `surgical-marl play`: from outside, from near and from the endoscope, with words beside.
 
     env = make_env(settings, num_envs=16, arrays="numpy")
     film(env, Movers(env, "oracle"), Path("sixteen.mp4"), Look(grid=(4, 4)))
@@ -14,15 +14,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from PIL import Image, ImageDraw, ImageFont
+from numpy.typing import NDArray
 
 from surgical_marl.content import unknown
-from surgical_marl.view.history import summary
+from surgical_marl.view.camera import Focus
+from surgical_marl.view.captions import Caption, Captions, panel, written
 from surgical_marl.view.moment import Observer
 from surgical_marl.view.record import (
     FPS,
-    HEIGHT,
-    WIDTH,
     Picture,
     Pose,
     ScenePicture,
@@ -37,8 +36,10 @@ if TYPE_CHECKING:
     from surgical_marl.envs.batch import BatchedEnv
     from surgical_marl.view.movers import Movers
 
-WALL = 1280
-"""Pixels along the width of a film of several environments, about."""
+WIDTH, HEIGHT = 1280, 720
+"""Pixels of a film, about: one of several environments is as wide."""
+AFTER = 1.2
+"""Time that a film goes on after success, s."""
 SMALLEST, LARGEST = 16, 4096
 """Pixels of a side of a picture. A grid is at most twice as wide and high: a frame of 64 of the largest has 3 GB."""
 TURNS = 3600.0
@@ -58,7 +59,7 @@ class Look:
         slow: how many times slower than real time.
         camera: a camera of the scene by name, or a free one; None for the view in which the least is hidden.
         words: whether to write errors and stages into the pictures.
-        size: width and height of the picture of one environment, pixels; None for 480 and 360, and less in a grid.
+        size: width and height of the picture of one environment, pixels; None for 1280 and 720, and less in a grid.
         fps: pictures a second of the film, about.
 
     Raises:
@@ -95,15 +96,25 @@ class Look:
             return self.size
         if self.grid == (1, 1):
             return WIDTH, HEIGHT
-        width = WALL // self.grid[1] // 2 * 2
-        return width, width * HEIGHT // WIDTH // 2 * 2
+        width = WIDTH // self.grid[1] // 2 * 2
+        return width, 3 * width // 8 * 2
+
+    @property
+    def column(self) -> int:
+        """Width of the column beside the picture of a single environment, with words and insets, pixels."""
+        return self.tile[0] * 9 // 32
+
+    def inset(self, count: int) -> int:
+        """Return the height of each of so many insets, pixels: words have the rest of the column."""
+        _, height = self.tile
+        return min(self.column, height * 7 // 10 // count) if self.words else height // count
 
 
 class Shot(NamedTuple):
     """Content of a frame of one environment."""
 
     pose: Pose
-    words: list[str]
+    captions: list[Caption]
 
 
 def film(env: BatchedEnv, movers: Movers, path: Path, look: Look, episodes: int = 1, seed: int = 0) -> Path:
@@ -115,11 +126,18 @@ def film(env: BatchedEnv, movers: Movers, path: Path, look: Look, episodes: int 
 
 def pictures(env: BatchedEnv, movers: Movers, look: Look, episodes: int = 1, seed: int = 0) -> Iterator[Picture]:
     """Yield the pictures of a film, each of all environments."""
-    picture, scope = ScenePicture(env, *look.tile), _scope(env, look)
+    width, height = look.tile
+    alone = look.grid == (1, 1)
+    picture = ScenePicture(env, width - look.column if alone else width, height)
+    insets = _insets(env, look, picture.view) if alone else []
 
     def draw(shot: Shot) -> Picture:
-        seen = written(picture.draw(shot.pose, look.camera), shot.words)
-        return seen if scope is None else np.concatenate([seen, scope(shot.pose)], 1)
+        seen = picture.draw(shot.pose, look.camera)
+        if not alone:
+            return written(seen, shot.captions)
+        near = [inset(shot.pose) for inset in insets]
+        words = panel(shot.captions, look.column, height - sum(map(len, near)), height)
+        return np.concatenate([seen, np.concatenate([words, *near])], 1)
 
     def draw_all(shots: list[Shot]) -> Picture:
         return wall(map(draw, shots), look.grid[1])
@@ -157,53 +175,41 @@ def wall(pictures: Iterable[Picture], columns: int) -> Picture:
     return np.concatenate(rows, 0)
 
 
-def written(picture: Picture, lines: list[str]) -> Picture:
-    """Return a picture with lines of text in its upper left corner, on a dark ground."""
-    if not lines:
-        return picture
-    size = max(10, len(picture) // 24)
-    image = Image.fromarray(picture)
-    draw = ImageDraw.Draw(image, "RGBA")
-    font = ImageFont.load_default(size)
-    text = "\n".join(part for line in lines for part in _wrapped(line, font, picture.shape[1] - size - 8))
-    left, top, right, bottom = draw.multiline_textbbox((size // 2, size // 2), text, font=font)
-    draw.rectangle((left - 4, top - 4, right + 4, bottom + 4), fill=(0, 0, 0, 130))
-    draw.multiline_text((size // 2, size // 2), text, font=font, fill=(255, 255, 255, 255))
-    return np.asarray(image)
-
-
-def _wrapped(line: str, font: ImageFont.FreeTypeFont | ImageFont.ImageFont, width: float) -> list[str]:
-    """Return a line as several, parted at commas where it would be wider than so many pixels."""
-    found: list[str] = []
-    for part in line.split(", "):
-        if found and font.getlength(f"{found[-1]}, {part}") <= width:
-            found[-1] += f", {part}"
-        else:
-            found.append(f"  {part}" if found else part)
-    return found
-
-
 def _shots(
     env: BatchedEnv, movers: Movers, look: Look, picture: ScenePicture, episodes: int, seed: int
 ) -> Iterator[list[Shot]]:
-    """Yield the shots of each frame, one per environment, while the environments play."""
-    every, steps = steps_per_frame(env, look.fps * look.slow), episodes * env.max_steps
-    for step, (infos, ended) in enumerate(played(env, movers.actions, movers.begin, steps, seed), 1):
+    """Yield the shots of each frame, one per environment, while the environments play.
+
+    An episode of a task with stages ends `AFTER` all environments have succeeded.
+    """
+    every, captions = steps_per_frame(env, look.fps * look.slow), Captions(env)
+    done = np.zeros(env.num_envs)  # steps since success
+
+    def over(infos: Mapping[str, Mapping[str, Any]]) -> NDArray[np.bool_]:
+        nonlocal done
+        success = np.all([np.asarray(own["success"], bool) for own in infos.values()], axis=0)
+        done = np.where(success, done + 1, 0)
+        return np.full(env.num_envs, bool(env.task.stages) and bool((done * env.control_dt > AFTER).all()))
+
+    left, steps = episodes, episodes * env.max_steps
+    for step, (infos, ended) in enumerate(played(env, movers.actions, movers.begin, steps, seed, over), 1):
+        words = [captions.read(infos, index) if look.words else [] for index in range(env.num_envs)]
         if step % every == 0 or ended.any():
-            words = [_words(env, infos, index) if look.words else [] for index in range(env.num_envs)]
             yield [Shot(picture.pose(index), words[index]) for index in range(env.num_envs)]
+        if ended.any():
+            captions.forget(ended)
+            left, done = left - 1, np.where(ended, 0, done)
+            if ended.all() and not left:
+                return
 
 
-def _words(env: BatchedEnv, infos: Mapping[str, Mapping[str, Any]], index: int) -> list[str]:
-    time = float(np.asarray(env.steps)[index]) * env.control_dt
-    return [f"{time:.2f} s", *(f"{agent}  {', '.join(summary(infos[agent], index))}" for agent in env.agents)]
+def _insets(env: BatchedEnv, look: Look, view: View) -> list[Callable[[Pose], Picture]]:
+    """Return functions that draw the pictures beside a film: from near, and the endoscope's if there is one."""
+    cameras = [f"{agent}/left" for agent, mount in env.scene.mounts.items() if mount.arm.camera is not None]
+    width, height = look.column, look.inset(1 + len(cameras[:1]))
+    picture = ScenePicture(env, width, height)
 
+    def drawn(camera: str | Focus) -> Callable[[Pose], Picture]:
+        return lambda pose: picture.draw(pose, camera)
 
-def _scope(env: BatchedEnv, look: Look) -> Callable[[Pose], Picture] | None:
-    """Return a function that draws the endoscope's view; None in a scene without an endoscope, and in a grid."""
-    cameras = [agent for agent, mount in env.scene.mounts.items() if mount.arm.camera is not None]
-    if not cameras or look.grid != (1, 1):
-        return None
-    _, side = look.tile
-    picture = ScenePicture(env, side, side)
-    return lambda pose: picture.draw(pose, f"{cameras[0]}/left")
+    return [drawn(camera) for camera in (Focus(env.scene, view), *cameras[:1])]

@@ -76,7 +76,7 @@ class History:
 
 
 def summary(info: Mapping[str, Any], index: int = 0) -> list[str]:
-    """Summarise an agent's infos of a step: error, stages, success, collision and drop."""
+    """Summarise an agent's infos of a step: error, stages, success, collision, drop, and contacts without room."""
 
     def read(name: str) -> float:
         return float(np.asarray(info[name])[index])
@@ -86,4 +86,6 @@ def summary(info: Mapping[str, Any], index: int = 0) -> list[str]:
     if done:
         words.append("stages " + ", ".join(done))
     words += [name for name in ("success", "holding", "collision", "drop") if name in info and read(name)]
+    if "contact_overflow" in info and (left_out := round(read("contact_overflow"))):
+        words.append(f"{left_out} contacts left out")
     return words

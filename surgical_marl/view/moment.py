@@ -73,6 +73,8 @@ class Moment(NamedTuple):
     """Contacts of arms in the last step, for each environment."""
     grips: list[list[Grip]]
     """Fingers that pressed on free objects at the end of the last step, for each environment."""
+    nodes: dict[str, np.ndarray]
+    """Nodes of thread and tissue by name, [N, n, 3] each."""
 
 
 class Observer:
@@ -121,9 +123,8 @@ class Observer:
             pushes.append([] if forces is None else self._pushes(forces[row]))
             grips.append(self._grips(pressed[row]))
         marks = np.asarray(marks, float) if marks.size else np.zeros((count, 0, 3))
-        return Moment(
-            positions, quaternions, tips, poses.origin[:, : len(self._shapes)], env.held, marks, nearest, pushes, grips
-        )
+        objects = poses.origin[:, : len(self._shapes)]
+        return Moment(positions, quaternions, tips, objects, env.held, marks, nearest, pushes, grips, env.drawn_nodes)
 
     def _place(self, qpos: np.ndarray, origins: np.ndarray, quaternions: np.ndarray) -> None:
         data = self._data

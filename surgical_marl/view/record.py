@@ -17,10 +17,11 @@ from surgical_marl.envs.observations import replaced
 from surgical_marl.machine import cores
 from surgical_marl.policies.acting import forget
 from surgical_marl.runs.progress import progress
-from surgical_marl.view.camera import best_view, task_places
+from surgical_marl.view.camera import Focus, best_view, task_places
 from surgical_marl.view.drawn import Sphere
 from surgical_marl.view.render import Renderer, View
 from surgical_marl.view.shading import GOAL_RADIUS, goal_colour
+from surgical_marl.view.skin import skins
 from surgical_marl.view.stage import paint, stage
 from surgical_marl.view.video import write_video
 
@@ -37,8 +38,8 @@ LONGEST = 40.0
 """Seconds of a video at most: of a trial of three minutes it shows the beginning."""
 WIDTH, HEIGHT = 480, 360
 """Pixels of a picture unless asked otherwise."""
-LEAST = 3.0
-"""Radius of a goal's ball in the picture at least, pixels."""
+LEAST, MOST = 1 / 120, 1 / 40
+"""Radius of a goal's ball in the picture, at least and at most, as a share of its height."""
 THROUGH = 0.45
 """Share of a goal's colour that is seen through shapes in front of it."""
 
@@ -113,7 +114,12 @@ def _poses(env: BatchedEnv, policy: Act, picture: ScenePicture, episodes: int, s
 
 
 def played(
-    env: BatchedEnv, act: Act, begin: Callable[[Any, Any], None], steps: int, seed: int
+    env: BatchedEnv,
+    act: Act,
+    begin: Callable[[Any, Any], None],
+    steps: int,
+    seed: int,
+    over: Callable[[Mapping[str, Mapping[str, Any]]], NDArray[np.bool_]] | None = None,
 ) -> Iterator[tuple[dict[str, dict[str, Any]], NDArray[np.bool_]]]:
     """Play episodes, and yield after each step while the environments are as that step left them, ended or not.
 
@@ -123,6 +129,7 @@ def played(
         begin: called with observations, and with None before the first step or where episodes have ended, [N] bool.
         steps: how many.
         seed: of the first episodes.
+        over: takes the infos of a step, and returns which episodes end with it beside those that end themselves.
 
     Yields:
         Infos by agent, [N] each, and where the step ended an episode, [N] bool.
@@ -135,10 +142,12 @@ def played(
             outcome = env.step(dict(act(observations)))
             observations, ends = outcome.observations, outcome.terminated | outcome.truncated
             ended = np.array([bool(end) for end in ends])
+            if over is not None:
+                ended |= over(outcome.infos)
             yield outcome.infos, ended
             if ended.any():
                 observations = replaced(observations, np.flatnonzero(ended), env.reset(mask=ended)[0])
-            begin(observations, ends)
+            begin(observations, ended)
     finally:
         env.autoreset = before
 
@@ -163,6 +172,8 @@ class Pose(NamedTuple):
     """Orientations of the same, w, x, y, z, [k, 4]."""
     balls: list[Sphere]
     """A ball at each arm's goal."""
+    nodes: list[NDArray[np.float64]]
+    """Nodes of the skin of each system that has one, [n, 3] each, m."""
 
 
 class ScenePicture:
@@ -173,26 +184,28 @@ class ScenePicture:
 
     def __init__(self, env: BatchedEnv, width: int = WIDTH, height: int = HEIGHT) -> None:
         self._env, scene = env, env.scene
-        self._renderer = Renderer(scene.model, width, height, stage(scene), paint(scene))
-        self._view = best_view(scene, task_places(env.task), width / height)
+        self._skins = skins(scene.systems, scene.model)
+        self._renderer = Renderer(scene.model, width, height, stage(scene), paint(scene), self._skins)
+        self.view = best_view(scene, task_places(env.task), width / height)
+        """The view in which the least is hidden."""
 
-    def draw(self, pose: Pose | None = None, camera: str | View | None = None) -> Picture:
+    def draw(self, pose: Pose | None = None, camera: str | View | Focus | None = None) -> Picture:
         """Return a picture [height, width, 3] of the environment.
 
         It shows the environment as it was at `pose`, or as it is now if there is no `pose`. The `camera` is one of
-        `Renderer.render`; without one the least is hidden (`best_view`).
+        `Renderer.render`, or follows what happens; without one the least is hidden (`best_view`).
         """
         pose = pose or self.pose()
         data = mujoco.MjData(model := self._env.scene.model)
         data.qpos[:], data.mocap_pos[:], data.mocap_quat[:] = pose.qpos, pose.origins, pose.quaternions
         mujoco.mj_kinematics(model, data)
         mujoco.mj_camlight(model, data)
-        camera = camera or self._view
+        camera = camera(data) if isinstance(camera, Focus) else camera or self.view
         balls = pose.balls
-        if isinstance(camera, View):  # from afar a goal is larger than it is, or it would be a dot
-            least = LEAST * 2 * np.tan(np.radians(camera.fovy / 2)) / self._renderer.height * camera.distance
-            balls = [(place, max(radius, least), rgba) for place, radius, rgba in balls]
-        return self._renderer.render(data, camera, balls, THROUGH)
+        if isinstance(camera, View):  # from afar a goal is larger than it is, or it would be a dot; from near smaller
+            height = 2 * np.tan(np.radians(camera.fovy / 2)) * camera.distance
+            balls = [(place, np.clip(radius, LEAST * height, MOST * height), rgba) for place, radius, rgba in balls]
+        return self._renderer.render(data, camera, balls, THROUGH, pose.nodes)
 
     def pose(self, index: int = 0) -> Pose:
         """Return the current pose of an environment, by its number in the batch."""
@@ -205,4 +218,5 @@ class ScenePicture:
         qpos, origins, quaternions = (
             np.array(part[index], float) for part in (env.qpos, objects.origin, objects.quaternion)
         )
-        return Pose(qpos, origins, quaternions, balls)
+        nodes = env.drawn_nodes
+        return Pose(qpos, origins, quaternions, balls, [np.array(nodes[s.name][index], float) for s in self._skins])

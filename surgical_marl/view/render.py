@@ -24,6 +24,7 @@ from surgical_marl.content import unknown
 from surgical_marl.view import painter, tracer
 from surgical_marl.view.drawn import Drawn, Extra, Sphere
 from surgical_marl.view.shading import Material
+from surgical_marl.view.skin import Skin
 
 Array = NDArray[np.float64]
 
@@ -69,6 +70,7 @@ class Renderer:
         height: likewise.
         stage: shapes besides those of the model, such as a table.
         paint: geom -> what it is made of, or the rgb that suggests it, in place of its own colour.
+        skins: surfaces that are drawn in place of some geoms.
 
     Raises:
         ValueError: a size without pixels.
@@ -81,11 +83,12 @@ class Renderer:
         height: int = 360,
         stage: Sequence[Extra] = (),
         paint: Mapping[int, Material | Sequence[float]] = MappingProxyType({}),
+        skins: Sequence[Skin] = (),
     ) -> None:
         if width < 1 or height < 1:
             raise ValueError(f"a picture of {width} x {height} pixels has nothing to show: use 1 or more")
         self.model, self.width, self.height = model, width, height
-        self._drawn = Drawn(model, stage, paint)
+        self._drawn = Drawn(model, stage, paint, skins)
         self._wp = tracer.wp
         for module in (tracer, painter):  # here, so that threads need not wait for each other
             self._wp.load_module(module, device="cpu")
@@ -96,6 +99,7 @@ class Renderer:
         camera: str | View | None = None,
         spheres: Sequence[Sphere] = (),
         through: float = 0.0,
+        nodes: Sequence[Array] | None = None,
     ) -> NDArray[np.uint8]:
         """Return a picture [height, width, 3] of the pose in `data`, after `mj_forward`.
 
@@ -105,12 +109,14 @@ class Renderer:
                 view of the whole model.
             spheres: drawn besides the model.
             through: share of a sphere's colour, from 0 to 1, that is seen through what hides it.
+            nodes: where the nodes of each skin are, [n, 3] each, m; None for at rest.
         """
         place, axes, fovy = self._camera(data, camera)
         wp, size = self._wp, (self.height, self.width)
         pixel = 2 * np.tan(np.deg2rad(fovy) / 2) / self.height
-        world, shapes = self._drawn.at(data, place, pixel, spheres, through)
-        self._list(world, shapes, [self._eye(place, axes, pixel, self.width, self.height), *self._lamps(axes)])
+        placed = self._drawn.at(data, place, pixel, spheres, through, nodes)
+        world = placed.world
+        self._list(world, placed.shapes, [self._eye(place, axes, pixel, self.width, self.height), *self._lamps(axes)])
         coarse = tuple(-(-side // int(painter.COARSE)) for side in size)
         pixels = painter.Pixels()
         pixels.depths = wp.empty(size, dtype=float, device="cpu")

@@ -21,6 +21,8 @@ HALF_OPEN = wp.constant(0.7)
 """Share of the sky that counts as seen from surfaces that look down."""
 SIDES = wp.constant(4)
 """Sides of a shape that edges are smoothed between, at most."""
+RAYS = wp.constant(12)
+"""Rays from a point to a lamp that a mesh may hide."""
 DARK = wp.constant(0.004)
 """Share of a lamp that counts as nothing."""
 PLANE = wp.constant(5)
@@ -193,9 +195,12 @@ def lit(world: World, lamp: Eye, point: wp.vec3, own: int, joint: float):
             cover = float(0.0)
             p, v = -(world.shapes[shape].back @ towards), world.shapes[shape].back @ way
             if world.shapes[shape].kind == MESH:
-                query = wp.mesh_query_ray(world.shapes[shape].mesh, p, v, distance)
-                if query.result:
-                    cover = 1.0
+                for k in range(RAYS):  # to points all over the lamp, in a spiral
+                    away, angle = lamp.spread * distance * wp.sqrt((float(k) + 0.5) / float(RAYS)), 2.4 * float(k)
+                    aim = way * distance + away * (lamp.axes @ wp.vec3(wp.cos(angle), wp.sin(angle), 0.0))
+                    turned = world.shapes[shape].back @ wp.normalize(aim)
+                    if wp.mesh_query_ray(world.shapes[shape].mesh, p, turned, distance).result:
+                        cover += 1.0 / float(RAYS)
             else:
                 cover = hidden(
                     world.shapes[shape].shadow_kind,

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import imageio.v3 as imageio
 import numpy as np
@@ -11,14 +13,15 @@ import pytest
 
 from surgical_marl.cli.main import main
 from surgical_marl.envs.batch import BatchedEnv
-from surgical_marl.view.film import Look, camera_of, film, pictures, wall, written
+from surgical_marl.view.captions import GROUND, Caption, Captions, colour_of, panel, written
+from surgical_marl.view.film import Look, camera_of, film, pictures, wall
 from surgical_marl.view.movers import Movers, first
 from surgical_marl.view.render import View
 
 
 def test_words_are_in_the_upper_left_corner_alone() -> None:
     plain = np.full((240, 320, 3), 200, np.uint8)
-    changed = (written(plain, ["1.00 s", "psm_0  0.05 mm"]) != plain).any(-1)
+    changed = (written(plain, [Caption("1.00 s"), Caption("psm_0  0.05 mm")]) != plain).any(-1)
     assert changed[:120, :160].any()
     assert not changed[120:].any() and not changed[:, 200:].any()
     assert written(plain, []) is plain
@@ -26,12 +29,47 @@ def test_words_are_in_the_upper_left_corner_alone() -> None:
 
 def test_long_lines_are_wrapped_at_commas() -> None:
     plain = np.full((240, 320, 3), 200, np.uint8)
-    words = ", ".join(["psm_0  0.05 mm", *(f"stage_{number}" for number in range(12))])
+    words = Caption(", ".join(["psm_0  0.05 mm", *(f"stage_{number}" for number in range(12))]))
     changed = (written(plain, [words]) != plain).any(-1)
     rows, columns = np.flatnonzero(changed.any(1)), np.flatnonzero(changed.any(0))
     assert columns[-1] < 319 and columns[-1] > 200
-    one = np.flatnonzero((written(plain, ["psm_0"]) != plain).any((1, 2)))
+    one = np.flatnonzero((written(plain, [Caption("psm_0")]) != plain).any((1, 2)))
     assert len(rows) > 1.4 * len(one)
+
+
+def test_words_of_a_panel_have_their_colours() -> None:
+    captions = [Caption("psm_0", colour_of(0)), Caption("psm_1", colour_of(1))]
+    found = panel(captions, 120, 90, 300).astype(int)
+    assert found.shape == (90, 120, 3) and (found[-1] == GROUND).all()
+    for _, colour in captions:
+        assert (np.abs(found - colour).max(-1) < 30).any()
+
+
+def test_stages_stay_reached_until_an_episode_ends() -> None:
+    task = SimpleNamespace(stages=("lifted", "placed"))
+    steps, agents = np.array([7, 7]), ("psm_0", "psm_1")
+    env: Any = SimpleNamespace(
+        num_envs=2, agents=agents, steps=steps, control_dt=0.02, task_name="peg_transfer", task=task
+    )
+    captions = Captions(env)
+
+    def texts(index: int, lifted: list[bool], success: bool = False, dropped: bool = False) -> list[str]:
+        own = {"stage_lifted": np.array(lifted), "stage_placed": np.array([False, False])}
+        own |= {"success": np.array([success] * 2), "drop": np.array([dropped] * 2)}
+        return [text for text, _ in captions.read(dict.fromkeys(env.agents, own), index)]
+
+    assert texts(0, [False, False]) == ["0.14 s  peg_transfer", "psm_0  ", "psm_1  ", "- lifted", "- placed"]
+    assert texts(0, [True, False])[3:] == ["+ lifted", "- placed"]
+    assert texts(0, [False, False], success=True)[3:] == ["+ lifted", "- placed", "success"]
+    assert texts(1, [False, False], dropped=True) == [
+        "0.14 s  peg_transfer",
+        "psm_0  drop",
+        "psm_1  drop",
+        "- lifted",
+        "- placed",
+    ]
+    captions.forget(np.array([True, False]))
+    assert texts(0, [False, False])[3:] == ["- lifted", "- placed"]
 
 
 def test_a_wall_has_its_pictures_row_by_row() -> None:
@@ -67,11 +105,32 @@ def test_the_last_picture_of_a_film_is_of_the_last_step() -> None:
     assert short.autoreset and long.autoreset
 
 
+def test_a_film_of_a_task_with_stages_goes_on_for_a_little_after_success(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("surgical_marl.view.film.AFTER", 0.1)
+    env = BatchedEnv("reach", "psm", device="cpu", max_steps=50)
+    look = Look(size=(64, 48), fps=50.0)
+    assert len(list(pictures(env, Movers(env, "oracle"), look))) == 50
+    monkeypatch.setattr(type(env.task), "stages", ("there",))
+    shots = list(pictures(env, Movers(env, "oracle"), look, episodes=2))
+    assert 2 * 6 < len(shots) < 2 * 50
+
+
 def test_a_film_that_becomes_a_gif_says_why(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr("surgical_marl.view.video.ffmpeg_runs", lambda: False)
-    asked = ["play", "reach", "--scene", "psm", "--policy", "zero", "--size", "64x48", "--out", str(tmp_path / "a.mp4")]
+    asked = [
+        "play",
+        "reach",
+        "--scene",
+        "psm",
+        "--policy",
+        "zero",
+        "--size",
+        "160x60",
+        "--out",
+        str(tmp_path / "a.mp4"),
+    ]
     assert main(asked) == 0
     found = capsys.readouterr()
     assert found.out == f"{tmp_path / 'a.gif'}\n" and len(imageio.imread(tmp_path / "a.gif")) > 10
@@ -82,9 +141,9 @@ def test_a_film_that_becomes_a_gif_says_why(
 def test_an_endoscope_is_beside_and_a_grid_has_every_environment(tmp_path: Path) -> None:
     env = BatchedEnv("reach", "ecm", device="cpu", max_steps=2)
     frames = imageio.imread(film(env, Movers(env, "zero"), tmp_path / "scope.gif", Look()), index=None)
-    assert frames.shape[-3:-1] == (90, 120 + 90)
+    assert frames.shape[-3:-1] == (90, 120)
     large = film(env, Movers(env, "zero"), tmp_path / "large.webp", Look(size=(64, 32)))
-    assert imageio.imread(large).shape == (32, 64 + 32, 3)
+    assert imageio.imread(large).shape == (32, 64, 3)
     many = BatchedEnv("reach", "psm", num_envs=8, device="cpu", max_steps=2)
     look = Look(grid=(1, 8))
     picture = imageio.imread(film(many, Movers(many, "zero"), tmp_path / "grid.gif", look), index=None)

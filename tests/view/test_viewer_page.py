@@ -304,12 +304,18 @@ def test_plots_show_how_arms_grip_objects() -> None:
 
 def test_an_area_is_filled_while_an_arm_holds_an_object() -> None:
     drawn: list[Any] = []
-    server = SimpleNamespace(gui=SimpleNamespace(add_uplot=lambda data, series, **_: drawn.append((data, series))))
+    said = SimpleNamespace(visible=True)
+    gui = SimpleNamespace(
+        add_uplot=lambda data, series, **_: drawn.append((data, series)), add_markdown=lambda text: said
+    )
+    plots = Plots(SimpleNamespace(gui=gui), nullcontext())
     history = History(["psm_0"], dt=0.5, objects=["needle"])
     for force in (1.0, 2.0, 3.0):
         info = {"needle_force": [force], "needle_holding": [force > 1], "needle_slip": [0.0]}
         history.add({"psm_0": info}, {"psm_0": [0.0]})
-    Plots(server, nullcontext()).draw(history)
+    assert said.visible
+    plots.draw(history)
+    assert not said.visible
     data, (time_axis, force, held) = drawn[0]
     assert time_axis == {"label": "s"} and held["fill"].startswith(force["stroke"]) and "fill" not in force
     np.testing.assert_array_equal(data, [[-1.0, -0.5, 0.0], [1.0, 2.0, 3.0], [0.0, 2.0, 3.0]])

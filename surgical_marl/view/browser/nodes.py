@@ -13,11 +13,12 @@ import trimesh
 from surgical_marl.runtime import jnp
 from surgical_marl.tasks.base.path_task import PathTask
 from surgical_marl.tasks.base.task import APPROACH
-from surgical_marl.view.browser.shapes import body_glb
+from surgical_marl.view.browser.shapes import body_glb, stage_glb
 from surgical_marl.view.moment import Moment, Push
 from surgical_marl.view.session import Session
-from surgical_marl.view.shading import AGENTS, GOAL_RADIUS, materials
-from surgical_marl.view.stage import paint
+from surgical_marl.view.shading import AGENTS, GAMMA, GOAL_RADIUS, materials
+from surgical_marl.view.skin import Skin, skins
+from surgical_marl.view.stage import paint, stage
 
 if TYPE_CHECKING:
     from viser import ViserServer
@@ -78,9 +79,9 @@ class Nodes:
         self._shown = dict.fromkeys(PARTS, True)
         self._trailed = -1
         """The step of the session up to which trails are drawn."""
-        low = float(first.positions[..., 2].min()) - 0.1
-        self._scene.add_grid(
-            "/floor", 4.0, 4.0, position=(0, 0, low), cell_size=0.1, section_size=0.5, shadow_opacity=0.2
+        still = np.tile([1.0, 0.0, 0.0, 0.0], (env.num_envs, 1))
+        self._scene.add_batched_glb(
+            "/stage", stage_glb(stage(env.scene)), still, self.offsets, lod="off", cast_shadow=False
         )
         self._make_bodies(first)
         self._make_marks(first)
@@ -99,6 +100,9 @@ class Nodes:
         for body, handle in self._moving.items():
             handle.batched_positions = (moment.positions[:, body] + self.offsets).astype(np.float32)
             handle.batched_wxyzs = moment.quaternions[:, body].astype(np.float32)
+        for name, handles in self._skins.items():
+            for handle, nodes in zip(handles, moment.nodes[name], strict=True):
+                handle.vertices = nodes.astype(np.float32)
         self._tips.batched_positions = self._placed(moment.tips)
         if self._marks is not None:
             self._marks.batched_positions = self._placed(moment.marks)
@@ -139,7 +143,10 @@ class Nodes:
         scene = self._session.env.scene
         model, looks = scene.model, materials(scene.model, paint(scene))
         self._moving: dict[int, Any] = {}
-        for body in range(model.nbody):
+        own = skins(scene.systems, model)
+        self._skins = {skin.name: self._make_skin(skin, moment.nodes[skin.name]) for skin in own}
+        covered = {int(model.geom_bodyid[geom]) for skin in own for geom in skin.geoms}
+        for body in sorted({*range(model.nbody)} - covered):
             glb = body_glb(model, body, looks)
             if glb is None:
                 continue
@@ -149,6 +156,16 @@ class Nodes:
             handle = self._scene.add_batched_glb(f"/bodies/{body}", glb, *places, lod="off", receive_shadow=body == 0)
             if moves:
                 self._moving[body] = handle
+
+    def _make_skin(self, skin: Skin, nodes: np.ndarray) -> list[Any]:
+        """Return a mesh for each environment, of nodes [N, n, 3]."""
+        rgb = (255 * skin.material.colour ** (1 / GAMMA)).astype(np.uint8)
+        return [
+            self._scene.add_mesh_simple(
+                f"/skins/{skin.name}/{env}", own.astype(np.float32), skin.triangles, color=rgb, position=offset
+            )
+            for env, (own, offset) in enumerate(zip(nodes, self.offsets, strict=True))
+        ]
 
     def _make_marks(self, moment: Moment) -> None:
         env = self._session.env

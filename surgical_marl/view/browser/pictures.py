@@ -34,6 +34,9 @@ class Pictures:
 
             self._endoscope = Endoscope(scene, width=SIZE, height=SIZE)
         self.draw()
+        if not self._handles:
+            with folder:
+                server.gui.add_markdown("No pictures: this scene has no endoscope, and no agent observes a picture.")
 
     def draw(self) -> None:
         """Show the current pictures."""

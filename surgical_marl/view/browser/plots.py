@@ -74,12 +74,15 @@ class Plots:
     def __init__(self, server: ViserServer, folder: GuiTabHandle) -> None:
         self._gui, self._folder = server.gui, folder
         self._handles: dict[str, GuiUplotHandle] = {}
+        with folder:
+            self._empty = server.gui.add_markdown("Plots appear with the first steps.")
 
     def draw(self, history: History) -> None:
         """Show the last steps."""
         time = history.time
         if len(time) < 2:
             return
+        self._empty.visible = False
         for title, lines in curves(history).items():
             data = (time, *(np.nan_to_num(line.values, nan=0.0) for line in lines))
             if title in self._handles:

@@ -11,7 +11,10 @@ import trimesh
 from trimesh.visual.material import PBRMaterial
 from trimesh.visual.texture import TextureVisuals
 
+from surgical_marl.view.drawn import Extra
 from surgical_marl.view.shading import GAMMA, Material, visual_rgba
+from surgical_marl.view.tracer import PLANE
+from surgical_marl.vision.rays import BOX, CYLINDER, ELLIPSOID
 
 _VISIBLE = 2
 """The last group of visual geoms."""
@@ -20,6 +23,8 @@ _METAL = 0.4
 as the environment maps of viser are, makes a browser without a GPU seven times as slow."""
 _CREASE = 0.6
 """Angle of two faces in rad from which on their edge is sharp."""
+_GROUND = (12.0, 12.0, 0.01)
+"""Sides of the plate that stands for a plane, m."""
 
 _Geom: Any = mujoco.mjtGeom
 
@@ -41,6 +46,20 @@ def body_glb(model: mujoco.MjModel, body: int, looks: Sequence[Material]) -> byt
             scene.add_geometry(mesh)
     if not scene.geometry:
         return None
+    return bytes(scene.export(file_type="glb", include_normals=True))
+
+
+def stage_glb(stage: Sequence[Extra]) -> bytes:
+    """Return the shapes that stand around a scene as a GLB file in the world; a plane is a wide plate there."""
+    scene = trimesh.Scene()
+    for extra in stage:
+        size, pose = np.array(extra.size), np.eye(4)
+        pose[:3, :3], pose[:3, 3] = extra.axes, extra.place
+        mesh = trimesh.creation.box(_GROUND) if extra.kind == PLANE else _MADE[_KINDS[extra.kind]](size)
+        mesh.apply_transform(pose)
+        mesh = trimesh.graph.smooth_shade(mesh, angle=_CREASE)
+        mesh.visual = TextureVisuals(material=_material(extra.material, 1.0))
+        scene.add_geometry(mesh)
     return bytes(scene.export(file_type="glb", include_normals=True))
 
 
@@ -74,6 +93,9 @@ _MADE: dict[Any, Callable[[np.ndarray], trimesh.Trimesh]] = {
     _Geom.mjGEOM_CYLINDER: lambda size: trimesh.creation.cylinder(size[0], 2 * size[1], sections=40),
     _Geom.mjGEOM_BOX: lambda size: trimesh.creation.box(2 * size),
 }
+
+
+_KINDS = {int(BOX): _Geom.mjGEOM_BOX, int(CYLINDER): _Geom.mjGEOM_CYLINDER, int(ELLIPSOID): _Geom.mjGEOM_ELLIPSOID}
 
 
 def _mesh(model: mujoco.MjModel, index: int) -> trimesh.Trimesh:

@@ -25,6 +25,7 @@ from surgical_marl.view.browser.panel import Choice, Panel
 from surgical_marl.view.browser.pictures import Pictures
 from surgical_marl.view.browser.plots import Plots
 from surgical_marl.view.browser.server import close_server, open_server
+from surgical_marl.view.camera import best_view, task_places
 from surgical_marl.view.session import Pace, Session
 
 if TYPE_CHECKING:
@@ -34,6 +35,10 @@ FPS = 30.0
 """Times a second that the scene is drawn."""
 STEPPING = 0.6 / FPS
 """Time for steps between two drawings, s."""
+_ASPECT = 1.0
+"""Width over height that the first view holds all in: a page of 1400 x 900 pixels has more beside its panel."""
+_WALL = np.linspace((172, 182, 194), (206, 213, 220), 64).astype(np.uint8)[:, None]
+"""A wall that is lighter below, as in films, [64, 1, 3]."""
 _SLOWER = {"trails": 3, "pictures": 4, "text": 6, "plots": 8}
 """Every how many drawings these are drawn."""
 
@@ -185,16 +190,12 @@ def _settings(choice: Choice, old: Session) -> tuple[Settings, dict[str, str] | 
 
 
 def _aim(camera: InitialCameraConfig, session: Session) -> None:
-    """Let a camera look at all tool tips from where no arm stands: from across the bases of the arms."""
-    tips = session.moment().tips.mean((0, 1))
-    stat, count = session.env.scene.model.stat, session.env.num_envs
-    away = (tips - stat.center) * [1, 1, 0]
-    length = float(np.linalg.norm(away))
-    away = away / length if length > 1e-3 else np.array([0.0, 1.0, 0.0])
-    up = np.array([0.0, 0.0, stat.extent])
-    camera.look_at = tips + 0.03 * up
-    camera.position = camera.look_at + (0.42 * stat.extent * away + 0.26 * up) * (1 + 0.7 * (count - 1))
-    camera.fov = float(np.deg2rad(50))
+    """Let a camera look at all arms and at the work, from where the least is hidden."""
+    env = session.env
+    view = best_view(env.scene, task_places(env.task), _ASPECT, whole=True)
+    view = replace(view, distance=view.distance * (1 + 0.7 * (env.num_envs - 1)))
+    camera.look_at, (camera.position, _) = np.asarray(view.lookat), view.pose()
+    camera.fov = float(np.deg2rad(view.fovy))
 
 
 def _light(server: ViserServer) -> None:
@@ -202,5 +203,7 @@ def _light(server: ViserServer) -> None:
     server.scene.set_up_direction("+z")
     server.scene.configure_environment_map(None)
     server.scene.configure_default_lights(enabled=True, cast_shadow=True)
-    server.scene.add_light_hemisphere("/room", sky_color=(235, 242, 255), ground_color=(150, 130, 120), intensity=1.2)
+    server.scene.add_light_hemisphere("/room", sky_color=(235, 242, 255), ground_color=(150, 130, 120), intensity=0.8)
+    server.scene.set_background_image(_WALL)
     server.gui.configure_theme(show_logo=False, show_share_button=False, control_width="large")
+    server.gui.main_panel.dock_right()  # beside the arms, and not over them
