@@ -212,4 +212,4 @@ def _insets(env: BatchedEnv, look: Look, view: View) -> list[Callable[[Pose], Pi
     def drawn(camera: str | Focus) -> Callable[[Pose], Picture]:
         return lambda pose: picture.draw(pose, camera)
 
-    return [drawn(camera) for camera in (Focus(env.scene, view), *cameras[:1])]
+    return [drawn(Focus(env.scene, view)), *map(drawn, cameras[:1])]
