@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
 from surgical_marl.plugins.task_file import label
-from surgical_marl.view.history import summary
+from surgical_marl.view.history import reported, summary
 from surgical_marl.view.shading import AGENTS
 
 if TYPE_CHECKING:
@@ -43,7 +43,7 @@ class Captions:
     """Reads the captions of environments, step by step."""
 
     def __init__(self, env: BatchedEnv) -> None:
-        self._env = env
+        self._env, self._reports = env, reported(env.scene)
         self._reached: list[set[str]] = [set() for _ in range(env.num_envs)]
 
     def read(self, infos: Mapping[str, Mapping[str, Any]], index: int) -> list[Caption]:
@@ -59,6 +59,9 @@ class Captions:
             found.append(Caption(f"{agent}  {', '.join(words)}", colour_of(number)))
         if any(_true(own, name, index) for own in infos.values() for name in _FAULTS):
             found[0] = found[0]._replace(colour=RED)
+        for name in self._reports:
+            value = float(np.asarray(infos[env.agents[0]][name])[index])
+            found.append(Caption(f"{name.replace('_', ' ')}  {value:.2f}", GREY))
         for name in env.task.stages:
             done = name in reached
             found.append(Caption(f"{'+' if done else '-'} {name.replace('_', ' ')}", WHITE if done else GREY))

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from surgical_marl.envs.infos import ERRORS
+
+if TYPE_CHECKING:
+    from surgical_marl.scenes.scene import Scene
 
 REWARD = "reward_"
 """Beginning of the names of infos of reward terms."""
@@ -23,12 +26,20 @@ class History:
         dt: time of a step, s.
         seconds: how long a step is remembered.
         objects: names of the free objects.
+        reports: infos of thread and tissue, the same for all agents (`reported`).
     """
 
-    def __init__(self, agents: Sequence[str], dt: float, seconds: float = 10.0, objects: Sequence[str] = ()) -> None:
-        self.agents, self.objects, self._dt = list(agents), list(objects), dt
+    def __init__(
+        self,
+        agents: Sequence[str],
+        dt: float,
+        seconds: float = 10.0,
+        objects: Sequence[str] = (),
+        reports: Sequence[str] = (),
+    ) -> None:
+        self.agents, self.objects, self.reports, self._dt = list(agents), list(objects), list(reports), dt
         grips = (f"{name}_{what}" for name in objects for what in GRIP)
-        self._wanted = {*ERRORS, "min_distance", "contact_force", *grips}
+        self._wanted = {*ERRORS, "min_distance", "contact_force", *grips, *reports}
         self._room = max(2, round(seconds / dt))
         self._rows: dict[tuple[str, str], np.ndarray] = {}
         self._count = 0
@@ -73,6 +84,11 @@ class History:
         """Return the name of the agent's error and its values in mm, [T]; an empty name if it has none."""
         name = next((name for name in ERRORS if (agent, name) in self._rows), "")
         return name, 1000 * self.read(agent, name)
+
+
+def reported(scene: Scene) -> list[str]:
+    """Return the names of infos of the systems of a scene, such as `tension` of thread and `tissue_force`."""
+    return list(dict.fromkeys(name for system in scene.systems.values() for name in system.reports))
 
 
 def summary(info: Mapping[str, Any], index: int = 0) -> list[str]:

@@ -18,7 +18,7 @@ import numpy as np
 
 from surgical_marl.runs.content import copy_content
 from surgical_marl.runs.settings import Settings, make_env
-from surgical_marl.view.history import History
+from surgical_marl.view.history import History, reported
 from surgical_marl.view.moment import Moment, Observer
 from surgical_marl.view.movers import Movers, choices, first
 from surgical_marl.view.take import MOST_ENVS, MOST_STEPS, Take
@@ -67,7 +67,8 @@ class Session:
         """Movers of the arms."""
         self.movers = Movers(self.env, first(self.env) if who is None else who)
         self.choices += [name for name in dict.fromkeys(self.movers.who.values()) if name not in self.choices]
-        self.history = History(self.env.agents, self.env.control_dt, objects=list(self.env.scene.free_objects))
+        objects, reports = list(self.env.scene.free_objects), reported(self.env.scene)
+        self.history = History(self.env.agents, self.env.control_dt, objects=objects, reports=reports)
         self.infos: dict[str, dict[str, Any]] = {}
         """Infos of the last step, by agent; empty after a reset."""
         self.steps = 0

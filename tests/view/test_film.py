@@ -48,28 +48,39 @@ def test_words_of_a_panel_have_their_colours() -> None:
 def test_stages_stay_reached_until_an_episode_ends() -> None:
     task = SimpleNamespace(stages=("lifted", "placed"))
     steps, agents = np.array([7, 7]), ("psm_0", "psm_1")
+    thread = SimpleNamespace(reports=("tension",))
+    scene = SimpleNamespace(systems={"thread": thread, "other thread": thread})
     env: Any = SimpleNamespace(
-        num_envs=2, agents=agents, steps=steps, control_dt=0.02, task_name="peg_transfer", task=task
+        num_envs=2, agents=agents, steps=steps, control_dt=0.02, task_name="peg_transfer", task=task, scene=scene
     )
     captions = Captions(env)
 
     def texts(index: int, lifted: list[bool], success: bool = False, dropped: bool = False) -> list[str]:
         own = {"stage_lifted": np.array(lifted), "stage_placed": np.array([False, False])}
+        own |= {"tension": np.array([0.5, 0.25])}
         own |= {"success": np.array([success] * 2), "drop": np.array([dropped] * 2)}
         return [text for text, _ in captions.read(dict.fromkeys(env.agents, own), index)]
 
-    assert texts(0, [False, False]) == ["0.14 s  peg_transfer", "psm_0  ", "psm_1  ", "- lifted", "- placed"]
-    assert texts(0, [True, False])[3:] == ["+ lifted", "- placed"]
-    assert texts(0, [False, False], success=True)[3:] == ["+ lifted", "- placed", "success"]
+    assert texts(0, [False, False]) == [
+        "0.14 s  peg_transfer",
+        "psm_0  ",
+        "psm_1  ",
+        "tension  0.50",
+        "- lifted",
+        "- placed",
+    ]
+    assert texts(0, [True, False])[4:] == ["+ lifted", "- placed"]
+    assert texts(0, [False, False], success=True)[4:] == ["+ lifted", "- placed", "success"]
     assert texts(1, [False, False], dropped=True) == [
         "0.14 s  peg_transfer",
         "psm_0  drop",
         "psm_1  drop",
+        "tension  0.25",
         "- lifted",
         "- placed",
     ]
     captions.forget(np.array([True, False]))
-    assert texts(0, [False, False])[3:] == ["- lifted", "- placed"]
+    assert texts(0, [False, False])[4:] == ["- lifted", "- placed"]
 
 
 def test_a_wall_has_its_pictures_row_by_row() -> None:

@@ -277,6 +277,8 @@ def test_history_keeps_the_last_steps_in_order() -> None:
 def test_a_summary_says_error_stages_and_faults() -> None:
     info = {"tip_error": [0.00123], "stage_grasped": [1], "stage_lifted": [0], "collision": [True], "success": [False]}
     assert summary(info) == ["1.23 mm", "stages grasped", "collision"]
+    assert summary({"contact_overflow": [2.0, 0.0]}) == ["2 contacts left out"]
+    assert summary({"contact_overflow": [2.0, 0.0]}, 1) == []
 
 
 def test_names_are_escaped(session: Session) -> None:

@@ -39,7 +39,7 @@ from surgical_marl.view.browser.plots import Plots, curves
 from surgical_marl.view.browser.server import close_server, open_server, unlocked
 from surgical_marl.view.browser.shapes import body_glb, geom_mesh
 from surgical_marl.view.browser.viewer import Viewer
-from surgical_marl.view.history import History
+from surgical_marl.view.history import History, reported
 from surgical_marl.view.lighting import PLAIN
 from surgical_marl.view.session import Session
 from surgical_marl.view.shading import CLOTH, LOOKS, WET, Material
@@ -300,6 +300,17 @@ def test_plots_show_how_arms_grip_objects() -> None:
     (slip,) = plots["slip of block_red, mm"]
     np.testing.assert_allclose(slip.values, [0.0, 4.0])
     assert not any("needle" in title for title in plots)
+
+
+def test_plots_show_thread_and_tissue() -> None:
+    scene = load_scene("bimanual_psm_suture")
+    assert {"tension", "tissue_force"} <= {*reported(scene)} and len({*reported(scene)}) == len(reported(scene))
+    history = History(scene.agents, dt=0.5, reports=reported(scene))
+    for force in (0.0, 0.5):
+        info = {key: [force] for key in reported(scene)}
+        history.add(dict.fromkeys(scene.agents, info), {key: [0.0] for key in scene.agents})
+    (line,) = curves(history)["tissue force"]
+    np.testing.assert_array_equal(line.values, [0.0, 0.5])
 
 
 def test_an_area_is_filled_while_an_arm_holds_an_object() -> None:

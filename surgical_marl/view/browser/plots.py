@@ -1,4 +1,4 @@
-"""Live plots of one environment: error, distance, force, grips on objects, and every term of the reward."""
+"""Live plots of one environment: error, distance, forces, thread and tissue, grips on objects, terms of the reward."""
 
 from __future__ import annotations
 
@@ -39,6 +39,7 @@ def curves(history: History) -> dict[str, list[Curve]]:
         "contact force, N": [
             Curve(agent, own[i], history.read(agent, "contact_force")) for i, agent in enumerate(agents)
         ],
+        **{name.replace("_", " "): [Curve(name, _TERMS[0], history.read(agents[0], name))] for name in history.reports},
         **_grips(history, own),
         "reward": [Curve(agent, own[i], history.read(agent, "reward")) for i, agent in enumerate(agents)],
     }
