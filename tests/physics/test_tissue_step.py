@@ -26,6 +26,7 @@ HOLES = (((True, True),) * 3, ((True, True), (False, False), (True, True)), ((Tr
 SHEETS = {
     "sheet": strip(tears=1.5),
     "holes": strip(present=HOLES, size=(0.015, 0.012, 0.008), springs=(("front", 1e6),)),
+    "loose": strip(fixed=(), springs=(("left", 1e4),), present=(((True, True),) * 2,) * 3),
 }
 
 
@@ -78,7 +79,10 @@ def close(found: dict[str, np.ndarray], expected: Any, contacts: int, share: flo
 
 
 @pytest.mark.parametrize("device", DEVICES)
-@pytest.mark.parametrize(("sheet", "contacts", "q"), [("sheet", CONTACTS, 4), ("sheet", 0, 4), ("holes", CONTACTS, 8)])
+@pytest.mark.parametrize(
+    ("sheet", "contacts", "q"),
+    [("sheet", CONTACTS, 4), ("sheet", 0, 4), ("holes", CONTACTS, 8), ("loose", CONTACTS, 4)],
+)
 def test_cuda_code_computes_what_jax_does(sheet: str, contacts: int, q: int, device: str) -> None:
     tissue = SHEETS[sheet]
     (step, respond, move), nodes, (held, ends) = step_of(sheet), shaken(tissue, 4e-4), touched(tissue, contacts, q)

@@ -215,6 +215,18 @@ struct Brick {
         }
     }
 
+    // The block of the matrix of the upper and the lower node of edge 0 or 1 along z, [3, 3], times a factor.
+    __device__ void upright(int edge, float factor, float *found) const {
+        const float sign = edge ? -1.0f : 1.0f;
+        const float own[9] = {UPRIGHT_XX, sign * UPRIGHT_XY, UPRIGHT_XZ, sign * UPRIGHT_YX, UPRIGHT_YY,
+                              sign * UPRIGHT_YZ, UPRIGHT_ZX, sign * UPRIGHT_ZY, UPRIGHT_ZZ};
+        for (int i = 0; i < 3; i++) {
+            float half[3];
+            for (int j = 0; j < 3; j++) half[j] = factor * (turn[3 * i] * own[j] + turn[3 * i + 1] * own[3 + j] + turn[3 * i + 2] * own[6 + j]);
+            for (int j = 0; j < 3; j++) found[3 * i + j] = Vector::dot(half, turn + 3 * j);
+        }
+    }
+
     // The volume of a brick of these nodes [8, 3], as a share of that at rest. Nodes become modes.
     static __device__ float volume(float *x) {
         float gradient[9], c[3];

@@ -128,13 +128,17 @@ class Brick:
         self.lame, self.shear = lame_constants(young, poisson)
         signs = np.stack([np.prod(np.where(mode, -_SIGNS, 1), 1) for mode in CORNERS])  # [mode, node]
         self._slope = np.float32(-2 / self.size)
-        whole = stiffness(self.size, young, poisson).reshape(8, 3, 8, 3)
+        self.stiffness = stiffness(self.size, young, poisson)
+        """At rest, N/m, [24, 24]."""
+        whole = self.stiffness.reshape(8, 3, 8, 3)
         modal = np.einsum("sa,aibj,tb->sitj", signs, whole, signs)
         self.hourglass = modal[np.ix_(HOURGLASSES, range(3), HOURGLASSES, range(3))].reshape(12, 12).astype(np.float32)
         """Of the hourglass modes, [12, 12], mostly zeros."""
         self.hourglass[np.abs(self.hourglass) < 1e-6 * np.abs(self.hourglass).max()] = 0.0
         self.diagonal = np.einsum("aiaj->aij", whole).astype(np.float32)
         """Of each node, at rest, N/m, [8, 3, 3]."""
+        self.upright = np.einsum("aiaj->aij", whole[1::2, :, ::2]).astype(np.float32)
+        """Of each upper node and the one under it, at rest, N/m, [4, 3, 3]."""
 
     def deformed(self, x: Array) -> tuple[Cell, Array]:
         """Return a brick whose nodes are at x, m, [8, 3], and the forces on these, N, [8, 3]."""

@@ -1,5 +1,6 @@
 // What the threads of a block have in common: nodes and bricks that they share, and sums over all of them.
-// A thread has bricks thread, thread + threads, ..., and nodes likewise: EACH gives its own ones, and their numbers.
+// A thread has bricks thread, thread + threads, ...: EACH gives its own ones, and their numbers. It has columns of nodes
+// likewise: EACH_NODE gives their nodes, from below.
 // With one thread this is also code for a CPU.
 #ifdef __CUDA_ARCH__
 #define UNROLL _Pragma("unroll")
@@ -9,9 +10,16 @@
 #define EACH(own, number, count) \
     UNROLL for (int own = 0; own < ((count) + threads - 1) / threads; own++) \
         if (const int number = thread + own * threads; number < (count))
-enum { BRICKS_EACH = (BRICKS + threads - 1) / threads, NODES_EACH = (NODES + threads - 1) / threads };
+#define EACH_NODE(own, number) \
+    UNROLL for (int own = 0; own < NODES_EACH; own++) \
+        if (const int number = Block::node(own, thread); number < NODES)
+enum {
+    BRICKS_EACH = (BRICKS + threads - 1) / threads,
+    NODES_EACH = (NODES / LEVELS + threads - 1) / threads * LEVELS
+};
 
 struct Block {
+    static __device__ int node(int own, int thread) { return (thread + own / LEVELS * threads) * LEVELS + own % LEVELS; }
     // Sums up two numbers of each thread. Calls that follow each other take different boxes of 64 numbers.
     static __device__ void sum(float *pair, float *box) {
 #ifdef __CUDA_ARCH__
@@ -33,6 +41,34 @@ struct Block {
             const float *own = first + 3 * ((node & 4 ? STRIDE_X : 0) + (node & 2 ? STRIDE_Y : 0) + (node & 1));
             UNROLL
             for (int i = 0; i < 3; i++) found[3 * node + i] = own[i];
+        }
+    }
+    // The motions of a place with a body about a centre: along and about three axes.
+    static __device__ void motions(const float *place, const float *centre, float found[][3]) {
+        const float x = place[0] - centre[0], y = place[1] - centre[1], z = place[2] - centre[2];
+        const float all[6][3] = {{1, 0, 0}, {0, 1, 0}, {0, 0, 1}, {0, -z, y}, {z, 0, -x}, {-y, x, 0}};
+        UNROLL
+        for (int k = 0; k < 6; k++)
+            UNROLL
+            for (int i = 0; i < 3; i++) found[k][i] = all[k][i];
+    }
+    // Solves a symmetric, positive definite system of 6 equations in place: its lower half, row by row, and the right side.
+    static __device__ void solve(float *matrix, float *right) {
+        for (int j = 0; j < 6; j++) {
+            float *row = matrix + j * (j + 1) / 2;
+            const float least = 1e-7f * row[j];
+            for (int k = 0; k <= j; k++) {
+                const float *other = matrix + k * (k + 1) / 2;
+                for (int i = 0; i < k; i++) row[k] -= row[i] * other[i];
+                row[k] = k < j ? row[k] / other[k] : sqrtf(fmaxf(row[k], least));
+            }
+            for (int i = 0; i < j; i++) right[j] -= row[i] * right[i];
+            right[j] /= row[j];
+        }
+        for (int j = 5; j >= 0; j--) {
+            const float *row = matrix + j * (j + 1) / 2;
+            right[j] /= row[j];
+            for (int i = 0; i < j; i++) right[i] -= row[i] * right[j];
         }
     }
     static __device__ float mean(const float *lower) { return (lower[0] + lower[2] + lower[5]) / 3; }

@@ -4,8 +4,9 @@ A step linearises once, about the state at its start, and solves for the displac
 
     (mass / dt^2 + (1 + damping / dt) K + springs) u = mass (v / dt + gravity) + forces at the start
 
-from u = dt v, with the inverse of each node's own block [3, 3] as preconditioner. Nothing is assembled: a product with
-K is a loop over bricks. Loops over bricks and nodes are scans, since the fused engine keeps these as loops.
+from u = dt v. The preconditioner is the inverse of the blocks of columns, which are the nodes through the thickness: a
+block tridiagonal factor, since nodes are numbered along columns. But for that nothing is assembled: a product with K is
+a loop over bricks. Loops over bricks and nodes are scans, since the fused engine keeps these as loops.
 """
 
 from __future__ import annotations
@@ -19,9 +20,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from surgical_marl.physics.solver.cholesky import FULL, LOWER
+from surgical_marl.physics.solver.cholesky import FULL, LOWER, cholesky, solve_factored
 from surgical_marl.physics.systems.brick import Brick, Cell, inverse_symmetric, to_modes
 from surgical_marl.physics.systems.brick_grid import BrickGrid
+from surgical_marl.physics.systems.rigid_motion import point_jacobian
 
 LEFT, SHORTEST = 0.4, 1 / 16
 """Share of its volume that a brick keeps in a step at least, and the shortest part of a step that is tried for this."""
@@ -71,6 +73,8 @@ class Linear(NamedTuple):
     """Right side: all forces at the start, and mass times v / dt, N, [n, 3]."""
     block: Array
     """Each node's own block of the matrix, N/m, lower half, [n, 6]."""
+    upright: Array
+    """The block of each node and the one under it, N/m, [n, 9]; 0 where either is fixed or none is."""
     inertia: Array
     """The part of it that is not elastic, N/m, [n]."""
     guess: Array
@@ -105,6 +109,8 @@ class BrickSolver:
         self.grid, self.brick, self.support, self.iterations = grid, brick, support, iterations
         self.damping, self.stiffer = damping, stiffer
         self.free = (~support.fixed & (grid.mass > 0)).astype(np.float32)
+        self.loose = not support.fixed.any()
+        """True if nothing is fixed, so that the whole can move."""
 
     def stiffened(self, stiffer: Any) -> BrickSolver:
         """Return the solver with another factor of Young's modulus."""
@@ -122,24 +128,54 @@ class BrickSolver:
             block = inertia * jnp.array([1.0, 0.0, 1.0, 0.0, 0.0, 1.0])
             return mass * (v / dt + self.gravity) - support * (x - rest), block, inertia, free * dt * v
 
-        def add(sums: tuple[Array, Array], first: Array) -> tuple[tuple[Array, Array], Cell]:
-            nodes = first + jnp.asarray(grid.offsets)
+        def add(sums: tuple[Array, ...], first: Array) -> tuple[tuple[Array, ...], Cell]:
+            nodes, upper = first + jnp.asarray(grid.offsets), first + jnp.asarray(grid.offsets[1::2])
             cell, forces = self.brick.deformed(state.position[nodes])
-            own = blend * (cell.turn @ jnp.asarray(self.brick.diagonal) @ cell.turn.T)
-            force, block = sums
+            own, pair = (blend * (cell.turn @ k @ cell.turn.T) for k in (self.brick.diagonal, self.brick.upright))
+            force, block, upright = sums
             force = force.at[nodes].add(self.stiffer * forces, mode="promise_in_bounds")
             block = block.at[nodes].add(own[:, *LOWER], mode="promise_in_bounds")
-            return (force, block), cell
+            pair *= jnp.asarray(self.linked)[upper, None, None]
+            return (force, block, upright.at[upper].add(pair.reshape(4, 9), mode="promise_in_bounds")), cell
 
         rows = (*self._constants, state.position, jnp.asarray(self.support.rest), state.velocity)
         force, block, inertia, guess = jax.lax.map(begin, rows)
-        (force, block), cells = jax.lax.scan(add, (force, block), jnp.asarray(grid.first))
-        return Linear(cells, force, block, inertia, guess)
+        sums: tuple[Array, ...] = force, block, jnp.zeros((grid.nodes, 9))
+        sums, cells = jax.lax.scan(add, sums, jnp.asarray(grid.first))
+        return Linear(cells, *sums, inertia, guess)
+
+    @property
+    def linked(self) -> np.ndarray:
+        """Which nodes are free, as is the one under them, 0 or 1, [n]."""
+        return np.append(np.float32(0), self.free[1:] * self.free[:-1])
 
     @property
     def _constants(self) -> tuple[Array, Array, Array]:
         """Mass, stiffness of the support and freedom (0 or 1) of each node, [n]."""
         return jnp.asarray(self.grid.mass), jnp.asarray(self.support.stiffness), jnp.asarray(self.free)
+
+    def softness(self, dt: float) -> tuple[float, float]:
+        """Return how many times as far as its own block alone says a node in the middle of a face gives way, at rest.
+
+        Along the face and across it, as its neighbours move along. Of a part of the mesh: what is farther away does
+        not move within a step.
+        """
+        grid, bottom = self.grid, self.grid.side("bottom")
+        cells = np.minimum(grid.cells, [8, 8, 4])
+        density = float(grid.mass.sum() / (len(grid.first) * grid.cell.prod()))
+        part = BrickGrid(cells * grid.cell, np.ones(cells, bool), density)
+        inertia, under = part.mass / dt**2, part.side("bottom")
+        inertia[under] += self.support.stiffness[bottom].mean() + 1e9 * self.support.fixed[bottom].all()
+        matrix = np.diag(np.repeat(inertia.astype(float), 3))
+        own = (1 + self.damping / dt) * self.brick.stiffness
+        for nodes in part.first[:, None] + part.offsets:
+            places = (3 * nodes[:, None] + np.arange(3)).ravel()
+            matrix[np.ix_(places, places)] += own
+        (middle,) = np.flatnonzero((part.places == [*(cells[:2] // 2), cells[2]]).all(1))
+        place = 3 * middle + np.arange(3)
+        gives = np.linalg.solve(matrix, np.eye(len(matrix))[:, place])[place]
+        x, y, z = np.diag(gives) * np.diag(matrix)[place].mean()
+        return min(x, y), z
 
     def displacements(self, linear: Linear, springs: Springs | None, guess: Array, dt: Any) -> Array:
         """Return the displacements of the nodes in a step, m, [n, 3], from a guess that leaves what is fixed."""
@@ -171,7 +207,7 @@ class BrickSolver:
         free, block = jnp.asarray(self.free), linear.block
         if springs is not None:
             residual, block = _pushed(springs, u, residual), _stiffened(springs, block)
-        inverse = jax.lax.map(lambda lower: inverse_symmetric(lower[FULL])[LOWER], block)
+        none, factors = jnp.zeros(3), (_factorised(block, linear.upright), linear.upright)
 
         def matrix(p: Array, sums: Array) -> Array:
             """Return the matrix times p, [n, 3], in the rows of `sums`, which hold inertia times p."""
@@ -180,14 +216,34 @@ class BrickSolver:
                 sums += falls(p)
             return sums if springs is None else _springs_times(springs, p, sums)
 
-        def begin(sum_: Array, row: Any) -> tuple[Array, Any]:
-            residual, free, inverse, inertia = row
-            residual *= free
-            p = inverse[FULL] @ residual
-            return sum_ + residual @ p, (residual, p, inertia * p)
+        def up(found: tuple[Array, Array], residual: Array, factor: Any) -> tuple[tuple[Array, Array], Array]:
+            """Go up a column by one node, and add its part of the norm of the residual."""
+            sum_, below = found
+            left = residual - factor[1].reshape(3, 3) @ below
+            eased = factor[0][FULL] @ left
+            return (sum_ + left @ eased, eased), eased
 
-        rows = residual, free, inverse, linear.inertia
-        rz, (residual, p, ap) = jax.lax.scan(begin, jnp.float32(0.0), rows)
+        def direction(eased: Array, p: Array, share: Any) -> tuple[Array, Array]:
+            """Return the next direction, m, [n, 3], and inertia times that, by going down all columns."""
+
+            def down(above: Array, row: Any) -> tuple[Array, tuple[Array, Array]]:
+                eased, p, inverse, upright, inertia = row
+                z = eased - inverse[FULL] @ above
+                p = z + share * p
+                return upright.reshape(3, 3).T @ z, (p, inertia * p)
+
+            rows = eased, p, *factors, linear.inertia
+            found: tuple[Array, Array] = jax.lax.scan(down, none, rows, reverse=True)[1]
+            return found
+
+        def begin(found: tuple[Array, Array], row: Any) -> tuple[tuple[Array, Array], Any]:
+            residual, free, factor = row
+            residual *= free
+            found, eased = up(found, residual, factor)
+            return found, (residual, eased)
+
+        (rz, _), (residual, eased) = jax.lax.scan(begin, (jnp.float32(0.0), none), (residual, free, factors))
+        p, ap = direction(eased, eased, 0.0)
 
         def goes_on(found: Any) -> Array:
             done, *_, rz = found
@@ -201,29 +257,65 @@ class BrickSolver:
                 own *= free
                 return (sums[0] + own @ p, sums[1] + inertia * (p @ p)), own
 
-            none = jnp.float32(0.0), jnp.float32(0.0)
-            (pap, least), ap = jax.lax.scan(project, none, (matrix(p, ap), p, free, linear.inertia))
+            start = jnp.float32(0.0), jnp.float32(0.0)
+            (pap, least), ap = jax.lax.scan(project, start, (matrix(p, ap), p, free, linear.inertia))
             length = rz / jnp.maximum(jnp.maximum(pap, least), 1e-30)  # all but inertia adds to it, save for rounding
 
-            def advance(sum_: Array, row: Any) -> tuple[Array, Any]:
-                u, residual, p, ap, inverse = row
+            def advance(found: tuple[Array, Array], row: Any) -> tuple[tuple[Array, Array], Any]:
+                u, residual, p, ap, factor = row
                 residual -= length * ap
-                return sum_ + residual @ (inverse[FULL] @ residual), (u + length * p, residual)
+                found, eased = up(found, residual, factor)
+                return found, (u + length * p, residual, eased)
 
-            after, (u, residual) = jax.lax.scan(advance, jnp.float32(0.0), (u, residual, p, ap, inverse))
-            share = after / jnp.maximum(rz, 1e-30)
-
-            def turn(row: Any) -> tuple[Array, Array]:
-                residual, p, inverse, inertia = row
-                p = inverse[FULL] @ residual + share * p
-                return p, inertia * p
-
-            p, ap = jax.lax.map(turn, (residual, p, inverse, linear.inertia))
-            return done + 1, u, residual, p, ap, after
+            rows = u, residual, p, ap, factors
+            (after, _), (u, residual, eased) = jax.lax.scan(advance, (jnp.float32(0.0), none), rows)
+            return done + 1, u, residual, *direction(eased, p, after / jnp.maximum(rz, 1e-30)), after
 
         start = jnp.int32(0), u, residual, p, ap, rz
         _, u, residual, *_ = jax.lax.while_loop(goes_on, iterate, start)
         return u, residual if springs is None else _pushed(springs, u, residual, -1.0)
+
+    def unbalanced(self, state: Nodes, linear: Linear, springs: Springs, u: Array, dt: Any) -> Array:
+        """Return the forces of all but bricks that inertia does not balance after displacements u, N, [n, 3]."""
+
+        def one(row: Any) -> Array:
+            mass, support, x, v, rest, u, inertia = row
+            return mass * (v / dt + self.gravity) - support * (x - rest) - inertia * u
+
+        mass, support, _ = self._constants
+        rows = mass, support, *state, jnp.asarray(self.support.rest), u, linear.inertia
+        return _pushed(springs, u, jax.lax.map(one, rows))
+
+    def balanced(self, position: Array, left: Array, inertia: Array, springs: Springs | None = None) -> Array:
+        """Return a rigid motion of all nodes, m, [n, 3], by which forces that are left have no sum and no torque.
+
+        Forces of bricks have neither, whatever gradients leave. So linear and angular momentum are right.
+
+        Args:
+            position: of the nodes, m, [n, 3].
+            left: forces of all but bricks that are not balanced by inertia, N, [n, 3].
+            inertia: by how much these fall as nodes move, N/m, [n].
+            springs: by which they fall besides.
+        """
+        centre = position[len(position) // 2]
+
+        def add(sums: tuple[Array, Array], row: Any) -> tuple[tuple[Array, Array], None]:
+            place, left, inertia = row
+            moves = point_jacobian(place - centre)
+            return (sums[0] + inertia * (moves.T @ moves), sums[1] + moves.T @ left), None
+
+        sums, _ = jax.lax.scan(add, (jnp.zeros((6, 6)), jnp.zeros(6)), (position, left, inertia))
+        if springs is not None:
+
+            def stiffen(own: Any, matrix: Array) -> Array:
+                moves = point_jacobian(own.weights @ position[own.nodes] - centre)  # weights sum to 1
+                return matrix + moves.T @ own.stiffness[FULL] @ moves
+
+            sums = _each(springs, stiffen, sums[0]), sums[1]
+        motion = solve_factored(cholesky(sums[0]), sums[1])
+        rows = position, jnp.asarray(self.free)
+        found: Array = jax.lax.map(lambda row: row[1] * (point_jacobian(row[0] - centre) @ motion), rows)
+        return found
 
     def _blend(self, dt: Any) -> Any:
         """Return the factor of the stiffness K of bricks in the matrix of a step: with damping."""
@@ -291,6 +383,18 @@ class BrickSolver:
 
         found: Array = jax.lax.scan(look, jnp.bool_(False), jnp.asarray(self.grid.first))[0]
         return found
+
+
+def _factorised(block: Array, upright: Array) -> Array:
+    """Return the inverses of the pivots of columns, m/N, lower halves, [n, 6], from their blocks [n, 6] and [n, 9]."""
+
+    def one(below: Array, row: tuple[Array, Array]) -> tuple[Array, Array]:
+        own, pair = row[0][FULL], row[1].reshape(3, 3)
+        inverse = inverse_symmetric(own - pair @ below @ pair.T)
+        return inverse, inverse[LOWER]
+
+    found: Array = jax.lax.scan(one, jnp.zeros((3, 3)), (block, upright))[1]
+    return found
 
 
 def _each(springs: Springs, of: Callable[[Any, Any], Any], start: Any) -> Any:

@@ -24,7 +24,7 @@ from surgical_marl.physics.contact.skin_detection import add_skin_contacts, near
 from surgical_marl.physics.contact.spring_contact import each
 from surgical_marl.physics.solver.cholesky import cholesky, solve_factored
 from surgical_marl.physics.systems.arms import ArmForces
-from surgical_marl.physics.systems.rigid_motion import Bodies, rotation
+from surgical_marl.physics.systems.rigid_motion import Bodies, point_jacobian, rotation
 from surgical_marl.physics.systems.system import (
     End,
     Ends,
@@ -261,7 +261,7 @@ class Coupling:
             number, mass, free, body = row
 
             def lever(end: End) -> Array:
-                return _motion_of(end.place - body.position)
+                return point_jacobian(end.place - body.position)
 
             def total(forces: Array) -> Array:
                 def add(row: Array, total: Array) -> Array:
@@ -368,7 +368,7 @@ class Coupling:
                     lambda: jnp.zeros(3),
                 )
             if k:
-                motion = _motion_of(end.place - bodies.position.at[body].get(mode="clip"))
+                motion = point_jacobian(end.place - bodies.position.at[body].get(mode="clip"))
                 found += jnp.where(body < k, motion @ by_body.at[body].get(mode="clip"), 0.0)
             return found + by_skins(end) if by_skins else found
 
@@ -426,11 +426,3 @@ def _towards(end: End, shift: Array) -> Array:
 
 def _joined(*parts: Any) -> Array:
     return jnp.concatenate([jnp.asarray(part) for part in parts])
-
-
-def _motion_of(offset: Array) -> Array:
-    """Return the matrix [3, 6] from the acceleration of a body to that of a point of it at an offset, m, [3]."""
-    x, y, z = offset
-    zero = jnp.zeros_like(x)
-    cross = jnp.stack([jnp.stack([zero, z, -y]), jnp.stack([-z, zero, x]), jnp.stack([y, -x, zero])])
-    return jnp.concatenate([jnp.eye(3), cross], 1)

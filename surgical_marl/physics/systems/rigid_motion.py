@@ -51,6 +51,14 @@ def rotation(quaternion: Array) -> Array:
     return jnp.stack([jnp.stack(row, -1) for row in rows], -2)
 
 
+def point_jacobian(offset: Array) -> Array:
+    """Return the matrix [3, 6] from the velocity of a body to that of a point of it at an offset, m, [3]."""
+    x, y, z = offset
+    zero = jnp.zeros_like(x)
+    cross = jnp.stack([jnp.stack([zero, z, -y]), jnp.stack([-z, zero, x]), jnp.stack([y, -x, zero])])
+    return jnp.concatenate([jnp.eye(3), cross], 1)
+
+
 def product(one: Array, other: Array) -> Array:
     """Return the product of quaternions [..., 4]: first `other`, then `one`."""
     a, u, b, v = one[..., :1], one[..., 1:], other[..., :1], other[..., 1:]

@@ -1,20 +1,34 @@
 // The step of tissue_step.py's `move`: displacements with additional forces, shortened where a brick would be crushed.
-__shared__ float x[3 * NODES], u[3 * NODES], push[3 * ROOM], gives[HELD * ROOM], weights[HELD * ROOM];
-__shared__ int nodes[HELD * ROOM];
-__shared__ short first[NODES], next[HELD * ROOM];
+__shared__ float x[3 * NODES];
 const int rows = in.total[0], moving = in.moving[0];
 
-for (int k = thread; k < 3 * NODES; k += threads) x[k] = in.nodes_position[k], u[k] = in.shift[k];
-for (int k = thread; k < HELD * rows; k += threads)
-    nodes[k] = in.held_nodes[k], weights[k] = in.held_weights[k], gives[k] = in.gives[k];
-for (int k = thread; k < 3 * moving; k += threads) push[k] = in.pushed[k];
-__syncthreads();
-if (moving > 0)
-    for (int n = thread; n < NODES; n += threads) {
-        Hung::link(nodes, weights, moving, n, first, next);
-        for (int k = first[n]; k >= 0; k = next[k])
-            for (int i = 0; i < 3; i++) u[3 * n + i] += gives[k] * push[3 * (k / HELD) + i];
+hang(rows);
+if (moving > 0) {
+    for (int k = thread; k < 3 * ROOM; k += threads) pull[k] = k < 3 * moving ? in.pushed[k] : 0.0f;
+    linearise();
+    assemble();
+    const auto push = [&](int n, float *found) {
+        for (int i = 0; i < 3; i++) found[i] = 0.0f;
+        add_pulls(n, found);
+    };
+    EACH_NODE(a, n) {
+        for (int i = 0; i < 3; i++) u[a][i] = 0.0f;
+        push(n, residual[a]);
     }
+    improve(0, PUSHES, LITTLE);
+    if (LOOSE) {
+        float left[NODES_EACH][3];
+        EACH_NODE(a, n) {
+            push(n, left[a]);
+            for (int i = 0; i < 3; i++) left[a][i] -= inertia[a] * u[a][i];
+        }
+        balance(left, 0);
+    }
+}
+for (int k = thread; k < 3 * NODES; k += threads) {
+    x[k] = in.nodes_position[k];
+    p[k] = in.shift[k] + (moving > 0 ? p[k] : 0.0f);
+}
 __syncthreads();
 
 float length = 1.0f;
@@ -23,7 +37,7 @@ for (bool crushed = true; crushed;) {
     for (int e = thread; e < BRICKS; e += threads) {
         float before[24], after[24];
         Block::corners(x + 3 * in.mesh_bricks[e], before);
-        Block::corners(u + 3 * in.mesh_bricks[e], after);
+        Block::corners(p + 3 * in.mesh_bricks[e], after);
         for (int i = 0; i < 24; i++) after[i] = before[i] + length * after[i];
         any |= Brick::volume(after) < LEFT * Brick::volume(before);
     }
@@ -32,15 +46,15 @@ for (bool crushed = true; crushed;) {
     crushed = crushed && length > 0;
 }
 for (int k = thread; k < 3 * NODES; k += threads) {
-    u[k] *= length;
-    x[k] += u[k];
+    p[k] *= length;
+    x[k] += p[k];
     out.position[k] = x[k];
-    out.velocity[k] = u[k] / DT;
+    out.velocity[k] = p[k] / DT;
 }
 __syncthreads();
 for (int c = thread; c < rows; c += threads) {
     float moved[3];
-    Block::point(u, nodes + HELD * c, weights + HELD * c, moved);
+    Block::point(p, nodes + HELD * c, weights + HELD * c, moved);
     for (int i = 0; i < 3; i++) out.points[3 * c + i] = moved[i];
 }
 bool torn = false;

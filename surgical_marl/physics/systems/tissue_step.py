@@ -10,6 +10,7 @@ an element and `brick_block.cu` for what a block's threads share.
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
@@ -35,6 +36,8 @@ ALONE = 6
 ENOUGH = 1e-15
 """Residual, in the norm of the inverse of the nodes' own blocks, at which conjugate gradients stop, J: displacements
 are then wrong by a few nm."""
+PUSHES, LITTLE = 6, 1e-12
+"""Conjugate gradients for displacements by additional forces on contacts, and the residual at which these stop, J."""
 MOST_THREADS, PAD = 256, 25
 """Threads of a block, and numbers in shared memory for a brick: one more than needed, so that threads use all banks."""
 MOST_SHARED = 48 * 1024
@@ -62,8 +65,6 @@ class Answer(NamedTuple):
     falls: Array
     """Of that force as the end moves, with what the tissue at its point gives way, N/m: lower halves, [c, 6]. Of
     contacts with what moves."""
-    gives: Array
-    """Displacements of each contact's nodes by a force on it, m/N, [c, q], likewise."""
 
 
 class Moved(NamedTuple):
@@ -125,7 +126,8 @@ class TissueStep:
     def move(self, nodes: Nodes, held: Held, ends: Ends, answer: Answer, pushed: Array) -> Moved:
         """Return the tissue after displacements `answer.shift` and those by additional forces [c, 3] on contacts, N."""
         stage = self._stage("move", self.moved, held)
-        return stage(nodes, held, ends.moving, ends.total, answer.shift, answer.gives, pushed, self.mesh)
+        stiffer = jnp.float32(self.solver.stiffer)
+        return stage(nodes, held, ends.moving, ends.total, answer.shift, pushed, stiffer, self.mesh)
 
     def _stage(self, kernel: str, reference: Callable[..., R], held: Held) -> Callable[..., R]:
         grid, (rows, q) = self.solver.grid, held.nodes.shape
@@ -134,6 +136,11 @@ class TissueStep:
         if shared > MOST_SHARED:
             return reference
         return block_stage(reference, self.cuda(kernel, held), threads, f"tissue_{kernel}")
+
+    @cached_property
+    def softness(self) -> tuple[float, float]:
+        """By how much more the tissue gives way to contacts than the blocks of nodes say, along its face and across."""
+        return self.solver.softness(self.dt)
 
     # -- the reference
 
@@ -152,51 +159,76 @@ class TissueStep:
             felt = self.feel(end, _point(held, row, u) - end.shift)
             return felt.force + felt.stiffness @ _point(held, row, u), felt.stiffness[LOWER]
 
-        def improve(_: Any, found: tuple[Array, ...]) -> tuple[Array, ...]:
-            u, residual, _ = found
+        def springs_at(u: Array) -> Springs:
             force, stiffness = each(ends, lambda row, end: spring(row, end, u))
-            springs = Springs(*held, force, stiffness, ends.total)
-            u, residual = solver.improved(linear, springs, u, residual, dt, iterations, ENOUGH, load and load.falls)
-            return u, residual, each(ends, lambda row, _: force[row] - stiffness[row][FULL] @ _point(held, row, u))
+            return Springs(*held, force, stiffness, ends.total)
 
-        residual = solver.residual(linear, linear.guess, dt)
+        def improve(_: Any, found: tuple[Array, ...]) -> tuple[Array, ...]:
+            u, residual, *_ = found
+            springs = springs_at(u)
+            u, residual = solver.improved(linear, springs, u, residual, dt, iterations, ENOUGH, load and load.falls)
+            return u, residual, springs.force, springs.stiffness
+
+        def pulls(row: Array, _: End) -> Array:
+            return force[row] - stiffness[row][FULL] @ _point(held, row, u)
+
+        residual, rows = solver.residual(linear, linear.guess, dt), len(held.nodes)
         if load:
             residual -= load.falls(linear.guess)
-        start = linear.guess, residual, jnp.zeros((len(held.nodes), 3))
-        u, _, force = jax.lax.fori_loop(0, jnp.where(touched, ROUNDS, 1), improve, start)
+        start = linear.guess, residual, jnp.zeros((rows, 3)), jnp.zeros((rows, 6))
+        u, _, force, stiffness = jax.lax.fori_loop(0, jnp.where(touched, ROUNDS, 1), improve, start)
+        if solver.loose:
+            springs = Springs(*held, force, stiffness, ends.total)
+            left = solver.unbalanced(nodes, linear, springs, u, dt)
+            if load:
+                left += load.force - load.falls(u)
+            u += solver.balanced(nodes.position, left, linear.inertia, springs)
+        force = each(ends, pulls)
 
-        def eased(row: Array, end: End) -> tuple[Array, Array]:
-            # the contact's spring is in series with the tissue at its point, whose other nodes stay
+        beside, across = self.softness
+
+        def eased(row: Array, end: End) -> Array:
+            # the contact's spring is in series with the tissue at its point
             own, weights = row_of(held, row)
-            block = linear.block[own]
-            gives = weights * jnp.asarray(solver.free)[own] / ((block[:, 0] + block[:, 2] + block[:, 5]) / 3)
-            stiffness = self.feel(end, _point(held, row, u) - end.shift).stiffness
-            normal = end.normal @ stiffness @ end.normal
-            along = (jnp.trace(stiffness) - normal) / 2
-            normal, along = (k / (1 + k * (weights @ gives)) for k in (normal, along))
-            return (along * jnp.eye(3) + (normal - along) * jnp.outer(end.normal, end.normal))[LOWER], gives
+            block, own_stiffness = linear.block[own], stiffness[row][FULL]
+            gives = weights * weights * jnp.asarray(solver.free)[own]
+            give = jnp.sum(gives / ((block[:, 0] + block[:, 2] + block[:, 5]) / 3))
+            normal = end.normal @ own_stiffness @ end.normal
+            along = (jnp.trace(own_stiffness) - normal) / 2
+            normal, along = normal / (1 + normal * across * give), along / (1 + along * beside * give)
+            return (along * jnp.eye(3) + (normal - along) * jnp.outer(end.normal, end.normal))[LOWER]
 
-        return Answer(u, force, *each(ends, eased, moving=True))
+        return Answer(u, force, each(ends, eased, moving=True))
 
     def moved(
-        self, nodes: Nodes, held: Held, moving: Array, total: Array, shift: Array, gives: Array, pushed: Array,
+        self, nodes: Nodes, held: Held, moving: Array, total: Array, shift: Array, pushed: Array, stiffer: Any,
         mesh: Any,
     ) -> Moved:  # fmt: skip
         """Return what `move` does."""
         del mesh  # for the kernel
+        solver, dt = self.solver.stiffened(stiffer), self.dt
 
-        def add(row: Array, u: Array) -> Array:
-            for node, give in zip(held.nodes[row], gives[row], strict=True):
-                u = u.at[node].add(give * pushed[row], mode="promise_in_bounds")
-            return u
+        def add(row: Array, forces: Array) -> Array:
+            for node, weight in zip(held.nodes[row], held.weights[row], strict=True):
+                forces = forces.at[node].add(weight * pushed[row], mode="promise_in_bounds")
+            return forces
+
+        def pushed_on(shift: Array) -> Array:
+            forces = jax.lax.fori_loop(0, moving, add, jnp.zeros_like(shift))
+            linear = solver.linearise(nodes, dt)
+            u, _ = solver.improved(linear, None, jnp.zeros_like(shift), forces, dt, PUSHES, LITTLE)
+            if solver.loose:
+                left = forces - linear.inertia[:, None] * u
+                u += solver.balanced(nodes.position, left, linear.inertia)
+            return shift + u
 
         def note(row: Array, points: Array) -> Array:
             return put(points, row, _point(held, row, u))
 
-        u = jax.lax.fori_loop(0, moving, add, shift)
-        u = self.solver.shortened(nodes, u)
-        after = self.solver.moved(nodes, u, self.dt)
-        torn = jnp.bool_(False) if self.tears is None else self.solver.stretched(after.position, self.tears)
+        u = jax.lax.cond(moving > 0, pushed_on, lambda shift: shift, shift)
+        u = solver.shortened(nodes, u)
+        after = solver.moved(nodes, u, dt)
+        torn = jnp.bool_(False) if self.tears is None else solver.stretched(after.position, self.tears)
         return Moved(*after, jax.lax.fori_loop(0, total, note, jnp.zeros_like(pushed)), torn)
 
     # -- the kernels
@@ -217,10 +249,11 @@ class TissueStep:
         grid, brick = solver.grid, solver.brick
         wholes = {
             "NODES": grid.nodes, "BRICKS": len(grid.first), "ROOM": rows, "HELD": q, "PAD": PAD,
+            "LEVELS": grid.counts[2], "LOOSE": int(solver.loose),
             "STRIDE_X": grid.offsets[4], "STRIDE_Y": grid.offsets[2],
             "HOLDS": self.channels.first if self.channels else -1,
             "PRESSES": self.channels.pressing if self.channels else -1,
-            "ROUNDS": ROUNDS, "TURNS": TURNS, "ALONE": ALONE, "NEWTON": ITERATIONS,
+            "ROUNDS": ROUNDS, "TURNS": TURNS, "ALONE": ALONE, "PUSHES": PUSHES, "NEWTON": ITERATIONS,
         }  # fmt: skip
         diagonal = {
             f"DIAGONAL_{a}{b}": brick.diagonal[0, i, j]
@@ -228,11 +261,12 @@ class TissueStep:
             for j, b in enumerate("XYZ")
             if i <= j
         }
-        reals = diagonal | {f"SLOPE_{axis}": x for axis, x in zip("XYZ", -2 / brick.size, strict=True)} | {
+        upright = {f"UPRIGHT_{a}{b}": brick.upright[0, i, j] for i, a in enumerate("XYZ") for j, b in enumerate("XYZ")}
+        reals = diagonal | upright | {f"SLOPE_{axis}": x for axis, x in zip("XYZ", -2 / brick.size, strict=True)} | {
             "VOLUME": brick.volume, "LAME": brick.lame, "SHEAR": brick.shear, "CRUSHED": CRUSHED,
             "RESISTANCE": RESISTANCE * brick.young, "DT": dt, "BLEND": 1 + solver.damping / dt,
-            "GRAVITY": solver.gravity[2], "ENOUGH": ENOUGH, "LEFT": LEFT, "SHORTEST": SHORTEST,
-            "TEARS": self.tears or 0,
+            "GRAVITY": solver.gravity[2], "ENOUGH": ENOUGH, "LITTLE": LITTLE, "LEFT": LEFT, "SHORTEST": SHORTEST,
+            "TEARS": self.tears or 0, "BESIDE": self.softness[0], "ACROSS": self.softness[1],
         }  # fmt: skip
         terms = " ".join(
             f"y[{i}] = {' + '.join(f'{_real(row[j])} * x[{j}]' for j in np.flatnonzero(row))};"
@@ -242,8 +276,8 @@ class TissueStep:
             f"enum {{ {', '.join(f'{name} = {x}' for name, x in wholes.items())} }};",
             f"constexpr float {', '.join(f'{name} = {_real(x)}' for name, x in reals.items())};",
             f"#define HOURGLASS(x, y) {terms}",
-            *map(_source, ("brick_block", "brick", f"tissue_{kernel}")),
-            "#undef HOURGLASS\n#undef EACH\n#undef UNROLL",
+            *map(_source, ("brick_block", "brick", "brick_solve", f"tissue_{kernel}")),
+            "#undef HOURGLASS\n#undef EACH\n#undef EACH_NODE\n#undef UNROLL",
         ]
         return "\n".join(parts)
 
