@@ -47,8 +47,8 @@ from surgical_marl.view.tracer import PLANE
 
 Picture = Any
 
-SMALL, LARGE = (320, 240), (480, 360)
-"""Width and height of pictures and clips, and of an arm's portrait, pixels."""
+SMALL, LARGE, CLIP = (320, 240), (480, 360), (960, 540)
+"""Width and height of pictures, of an arm's portrait and of clips, pixels."""
 COLUMNS = 4
 """Scenes in a row of the picture of all scenes, and cells in a row of the page."""
 FPS, SECONDS = 12.5, 6.0
@@ -107,7 +107,7 @@ def clip(task: str, path: Path) -> str:
     who, scene = player(task)
     settings = common_settings([who], {"task": task, "scene": scene, "goals": "training"})
     env = make_env(replace(settings, seed=0), 1, "numpy")
-    look = Look(size=SMALL, fps=FPS, words=False)
+    look = Look(size=CLIP, fps=FPS)
     shown = islice(pictures(env, Movers(env, who), look), round(FPS * SECONDS))
     write_video(path, shown, FPS)
     env.close()
@@ -135,7 +135,7 @@ def page(captions: dict[str, str]) -> str:
         "# Gallery",
         "",
         "`make gallery` draws all of this again. A ring and a ball of the same colour are an arm and its target; a",
-        "yellow ball is a target of all arms. In clips with an endoscope its view is on the right.",
+        "yellow ball is a target of all arms. Beside a clip are its words, a view from near, and an endoscope's view.",
     ]
     for title, cells, columns in parts:
         lines += ["", f"## {title}", "", "|" + " |" * columns, "|" + "---|" * columns]

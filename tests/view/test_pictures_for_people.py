@@ -11,10 +11,11 @@ import pytest
 import surgical_marl as sm
 from surgical_marl.envs.env import Env
 from surgical_marl.robots.rotation import turned
+from surgical_marl.robots.spec import VISUAL_GROUP
 from surgical_marl.scenes.objects import load_object
 from surgical_marl.scenes.scene import Scene
 from surgical_marl.scenes.shapes import MATERIALS
-from surgical_marl.view.camera import best_view, seen
+from surgical_marl.view.camera import Focus, best_view, seen
 from surgical_marl.view.render import Renderer, View
 from surgical_marl.view.shading import AGENTS, GAMMA, LOOKS, RUBBER, STEEL, TEAM, goal_colour, material, materials
 from surgical_marl.view.stage import TABLE, paint, stage
@@ -230,6 +231,41 @@ def test_no_arm_hides_what_matters(name: str) -> None:
     assert seen(scene.model, data, eye, points).all()
     local = (points - eye) @ axes
     assert (np.abs(local[:, :2] / -local[:, 2:]) < np.tan(np.radians(view.fovy / 2)) * np.array([4 / 3, 1])).all()
+
+
+@pytest.mark.parametrize("name", ["psm_suture", "bimanual_star", "trimanual_psm_ecm"])
+def test_a_view_of_the_whole_holds_all_arms_and_their_work(name: str) -> None:
+    scene = sm.load_scene(name)
+    view, data, model = best_view(scene, aspect=1.0, whole=True), at_home(scene), scene.model
+    eye, axes = view.pose()
+    arms = np.flatnonzero([model.body(int(body)).name.partition("/")[0] in scene.agents for body in model.geom_bodyid])
+    shown = arms[model.geom_group[arms] == VISUAL_GROUP]
+    points = np.concatenate([data.geom_xpos[shown], [data.site(f"{agent}/tool_tip").xpos for agent in scene.agents]])
+    across, up, back = ((points - eye) @ axes).T
+    side = np.tan(np.radians(view.fovy / 2))
+    assert (np.abs(across / back).max() < side) and np.abs(up / back).max() < side and (back < 0).all()
+    assert max(np.ptp(across / back), np.ptp(up / back)) > 0.5 * side  # and they are not small
+
+
+@pytest.mark.parametrize(
+    "name, what",
+    [("psm_suture", "needle"), ("psm_needle", "needle"), ("bimanual_psm_tissue", "flap"), ("psm", "psm_0")],
+)
+def test_a_view_from_near_follows_what_a_scene_is_about(name: str, what: str) -> None:
+    scene = sm.load_scene(name)
+    data, model = at_home(scene), scene.model
+    follows = Focus(scene, best_view(scene))
+    owners = np.array([model.body(int(body)).name.partition("/")[0] for body in model.geom_bodyid])
+    own = data.geom_xpos[owners == what]
+    if what in scene.agents:
+        own = data.site(f"{what}/tool_tip").xpos[None]
+    view = follows(data)
+    assert (own.min(0) - 1e-9 <= view.lookat).all() and (own.max(0) + 1e-9 >= view.lookat).all()
+    half = view.distance * np.tan(np.radians(view.fovy / 2))
+    assert 0.02 <= half < 0.05
+    data.geom_xpos[owners == what] += 0.1
+    data.site_xpos[:] += 0.1
+    np.testing.assert_allclose(np.array(follows(data).lookat) - view.lookat, 0.1)
 
 
 def test_what_is_behind_something_is_not_seen() -> None:

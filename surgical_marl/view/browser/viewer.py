@@ -29,7 +29,7 @@ from surgical_marl.view.camera import best_view, task_places
 from surgical_marl.view.session import Pace, Session
 
 if TYPE_CHECKING:
-    from viser import InitialCameraConfig, ViserServer
+    from viser import ClientHandle, InitialCameraConfig, ViserServer
 
 FPS = 30.0
 """Times a second that the scene is drawn."""
@@ -73,6 +73,7 @@ class Viewer:
             self.session = Session(settings, who, num_envs, record, self._further)
             self.pace = Pace(self.session.env.control_dt)
             self._show()
+            self.server.on_client_connect(self._stand_back)
         except BaseException:
             close_server(self.server)
             raise
@@ -127,6 +128,13 @@ class Viewer:
             raise
         old.close()
         self._show()
+
+    def _stand_back(self, client: ClientHandle) -> None:
+        """Let a page that is higher than wide, as a phone's is, show all that a wide one shows."""
+        first, wider = self.server.initial_camera, _ASPECT / client.camera.aspect
+        if wider > 1:
+            look_at = np.asarray(first.look_at)
+            client.camera.position = look_at + wider * (np.asarray(first.position) - look_at)
 
     def _do(self, act: Callable[[], None]) -> None:
         try:
