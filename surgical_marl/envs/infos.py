@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from surgical_marl.runtime import jnp
+from surgical_marl.scenes.tissue_file import OVERLOAD
 
 if TYPE_CHECKING:
     from jax import Array
@@ -53,9 +54,10 @@ def infos(
         told: what action terms tell of the step, by agent and name.
     """
     success, stages, metrics = task.success(world), task.reached(world), task.metrics(world)
-    speeds, found = jnp.linalg.norm(moved, axis=-1) / np.float32(dt), {}
+    speeds, found, reported = jnp.linalg.norm(moved, axis=-1) / np.float32(dt), {}, _reported(scene, world)
+    overload = {"tissue": reported["tissue_force"] > OVERLOAD} if "tissue_force" in reported else {}
     for i, (agent, view) in enumerate(world.arms.items()):
-        broken = costs(scene.mounts[agent].arm, view, speeds[i])
+        broken = costs(scene.mounts[agent].arm, view, speeds[i]) | overload
         found[agent] = {
             "success": success[agent],
             "collision": view.collision,
@@ -65,7 +67,7 @@ def infos(
             **{f"stage_{name}": reached for name, reached in stages[agent].items()},
             **{f"reward_{name}": value for name, value in terms[agent].items()},
             **_handling(view),
-            **_reported(scene, world),
+            **reported,
             "cost": sum((cost.astype(jnp.float32) for cost in broken.values()), start=jnp.float32(0.0)),
             **{f"cost_{name}": cost for name, cost in broken.items()},
             **told[agent],

@@ -14,6 +14,9 @@ from surgical_marl.untrusted.values import shown
 
 MOST = 1000
 """Bricks of a piece of tissue."""
+OVERLOAD = 8.0
+"""Greatest force of one shape that tissue should bear, N. It is our own choice: a closed jaw presses on the edge of a
+flap of 5 mm with 5 to 7 N, and with up to 13 N where it takes more of it."""
 Side = Literal["left", "right", "front", "back", "bottom"]
 """Borders that can be held, in the tissue's frame: where x is least, largest, where y is so, and where z is least."""
 
