@@ -18,7 +18,7 @@ from torch import Tensor, nn
 
 from surgical_marl.interfaces.rsl_rl import RslRlVecEnv
 from surgical_marl.learning import distributed
-from surgical_marl.learning.constraint import Constraint
+from surgical_marl.learning.constraint import Constraint, check_cost
 from surgical_marl.learning.statistics import ValueScale, share_normalisers
 from surgical_marl.learning.storage import MultiAgentStorage
 from surgical_marl.policies.layout import Grouping
@@ -338,6 +338,7 @@ class Algorithm(PPO):
             )
         options, constraint = dict(cfg["algorithm"]), None
         if bounds := options.pop("constraint"):
+            check_cost(bounds["cost"], env.env)
             constraint = Constraint(layout, env.num_envs, **bounds).to(device)
         per_agent = 1 if constraint is None else 2
         num_values = per_agent * layout.num_agents

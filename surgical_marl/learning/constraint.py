@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor, nn
@@ -10,8 +11,17 @@ from torch import Tensor, nn
 from surgical_marl.learning import distributed
 from surgical_marl.policies.layout import Layout
 
+if TYPE_CHECKING:
+    from surgical_marl.envs.batch import BatchedEnv
+
 METRICS = ("cost_rate", "lagrange_multiplier")
 """Names of the values of `Constraint.metrics`."""
+
+
+def check_cost(cost: str, env: BatchedEnv) -> None:
+    """Raise ValueError for the cost of an overload of tissue in a scene that has none."""
+    if cost == "tissue" and not any("tissue_force" in system.reports for system in env.scene.systems.values()):
+        raise ValueError(f"constraint.cost must not be 'tissue' in scene {env.scene.name!r}, which has no tissue")
 
 
 class Constraint(nn.Module):

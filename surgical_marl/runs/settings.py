@@ -61,7 +61,7 @@ class ConstraintSettings(Checked):
 
     prefix: ClassVar[str] = "constraint."
 
-    cost: Literal["none", "collision", "distance", "force", "limit", "speed"] = "none"
+    cost: Literal["none", "collision", "distance", "force", "limit", "speed", "tissue"] = "none"
     limit: float = number(0.005, 0.0, 1.0)
     kp: float = number(10.0, 0.0, 1e6)
     ki: float = number(5.0, 0.0, 1e6)

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 import torch
 
 from surgical_marl.learning import train
-from surgical_marl.learning.constraint import Constraint
+from surgical_marl.learning.constraint import Constraint, check_cost
 from surgical_marl.plugins.algorithms import list_algorithms
 from surgical_marl.policies.layout import Layout
 from surgical_marl.runs.folder import read_metrics
@@ -130,3 +131,15 @@ def test_a_limit_is_held(limit: float, tmp_path: Path, monkeypatch: pytest.Monke
         assert sum(late) / 20 < 2 * limit and rows[-1]["lagrange_multiplier"] > 0.0
     for row in rows:
         assert row["cost_rate"] == pytest.approx(row["collision_rate"], abs=1e-6)
+
+
+@pytest.mark.parametrize(("reports", "fits"), [((), False), (("tension",), False), (("tissue_force",), True)])
+def test_a_cost_of_tissue_needs_tissue(reports: tuple[str, ...], fits: bool) -> None:
+    scene = SimpleNamespace(name="mine", systems={"string": SimpleNamespace(reports=reports)})
+    env: Any = SimpleNamespace(scene=scene)
+    check_cost("force", env)
+    if fits:
+        check_cost("tissue", env)
+        return
+    with pytest.raises(ValueError, match="must not be 'tissue' in scene 'mine', which has no tissue"):
+        check_cost("tissue", env)
