@@ -9,11 +9,11 @@ Observation   joint positions and velocities, tool tip, position targets, contac
               the way to the nearest tip, and the least distance between the arms. Base frame, SI units.
 Action        one number in [-1, 1] for every joint; the jaw opens above 0 and closes otherwise.
 Reward        the same for all arms, but for `clearance` and `collision`; weights in brackets. Progress over the best of
-              the episode so far: `reach`, first tool to the edge (20 / m); `pinch`, first hold (2); `lift`, the angle
-              by which the pinched edge is turned up about the side at which the flap hangs (2 / rad); `clear`, the room
-              up to 8 mm while the flap is pinched (4); `touch`, second tool to target while the way is clear (40 / m).
-              Of each step: `success` (0.5), `overload`, more than 8 N on tissue (-0.1), `collision` (-2), `clearance`
-              (0).
+              the episode so far: `reach`, first tool to the edge (20 / m); `pinch`, first hold, half of it for an edge
+              between the fingers (2); `lift`, the angle by which the pinched edge is turned up about the side at which
+              the flap hangs (2 / rad); `clear`, the room up to 8 mm while the flap is pinched (4); `touch`, second tool
+              to target while the way is clear (40 / m). Of each step: `success` (0.5), `overload`, more than 8 N on
+              tissue (-0.1), `collision` (-2), `clearance` (0).
 Success       for 0.2 s the flap is pinched, the second tool's way is clear, its tip is within 2 mm of the target on the
               lesion's upper face, and no shape presses on tissue by more than 8 N. The way leads straight from the
               target to the second tool's wrist, and from there along its shaft. It is clear where the room, the least
@@ -61,8 +61,8 @@ HOLD, SHORT = 0.2, 0.005
 """Time for which it has to, s, and by how much less it may be, as single steps are added up."""
 FELT = 0.3
 """Least force on tissue that is pinched, N."""
-BETWEEN = np.array([[-0.005, -0.004, -0.010], [0.005, 0.004, 0.001]])
-"""Box in the tool's frame in which a place of the edge is between the fingers, m."""
+BETWEEN = np.array([[-0.005, -0.0025, -0.010], [0.005, 0.0025, -0.0005]])
+"""Box in the tool's frame in which a place of the edge is between the fingers, m: a closed jaw has no room for it."""
 LIFTED = 0.3
 """Angle about its side by which the edge is turned up once it is lifted, rad."""
 HIGHEST = 2.4
@@ -106,7 +106,7 @@ class Best(NamedTuple):
     reach: Array
     """Least distance of the first tool from the edge, m; below 0 before the start."""
     pinch: Array
-    """1 once the flap was pinched, before that 0."""
+    """1 once the flap was pinched, 0.5 once its edge was between the fingers, before that 0."""
     lift: Array
     """Largest angle by which the pinched edge was turned up, rad; `HIGHEST` at most."""
     clear: Array
@@ -134,8 +134,10 @@ class Now(NamedTuple):
 
     reach: Array
     """Distance of the first tool from the place of the edge beside the lesion, m."""
+    between: Array
+    """True if a place of the edge is between the fingers of the first tool."""
     pinched: Array
-    """True if a place of the edge is between the fingers of the first tool, and something presses on the tissue."""
+    """True if it is, and something presses on the tissue."""
     lift: Array
     """Angle of the place of the edge that is nearest to the first tool, about the side at which the flap hangs, rad: 0
     where it hangs in the plane of that side, positive above."""
@@ -217,7 +219,7 @@ class Task(BaseTask):
         tip, axes = self._tool(world, self.first)
         ways = edge - tip
         own = ways @ axes
-        inside = ((own > BETWEEN[0]) & (own < BETWEEN[1])).all(-1)
+        between = ((own > BETWEEN[0]) & (own < BETWEEN[1])).all(-1).any()
         nearest = edge[jnp.argmin(jnp.sum(ways * ways, -1))] - flap.hinge
         other, others = self._tool(world, self.second)
         wrist = other - np.float32(WRIST) * others[:, 2]
@@ -225,7 +227,8 @@ class Task(BaseTask):
         room = jnp.minimum(_gap(seen.position, point, wrist), _gap(seen.position, wrist, _f32(mount.position)))
         return Now(
             known(_length(ways[grip])),
-            inside.any() & (seen.tissue_force > FELT),
+            between,
+            between & (seen.tissue_force > FELT),
             jnp.arctan2(nearest[2], nearest @ flap.outward),
             known(room),
             known(_length(other - point)),
@@ -245,7 +248,7 @@ class Task(BaseTask):
         room = jnp.clip(now.room / CLEAR, 0.0, 1.0)
         return Best(
             jnp.where(best.reach < 0, now.reach, jnp.minimum(best.reach, now.reach)),
-            jnp.maximum(best.pinch, as_float(now.pinched)),
+            jnp.maximum(best.pinch, (as_float(now.between) + as_float(now.pinched)) / 2),
             jnp.where(now.pinched, jnp.maximum(best.lift, lift), best.lift),
             jnp.where(now.pinched & (now.lift > 0), jnp.maximum(best.clear, room), best.clear),
             jnp.where(best.touch < 0, now.away, jnp.where(now.clear, jnp.minimum(best.touch, now.away), best.touch)),
@@ -266,7 +269,7 @@ class Task(BaseTask):
     def reward_terms(self, world: World) -> dict[str, dict[str, Array]]:
         """Return the terms of every task, and the team's terms, which each agent gets.
 
-        Progress over the best of the episode so far: `reach` (m), `pinch` (1 at the first hold), `lift` (rad), `clear`
+        Progress over the best of the episode so far: `reach` (m), `pinch` (1 in all), `lift` (rad), `clear`
         (1 at `CLEAR`) and `touch` (m). Of each step: `success` and `overload`, 0 or 1 each.
         """
         now, best, safety = self.now(world), world.goal.best, super().reward_terms(world)

@@ -51,22 +51,27 @@ def view(agent: str, pose: np.ndarray) -> Any:
 
 
 def world(
-    degrees: float = FOLDED, away: Any = (0.0, 0.0, 0.0), beside: float = 0.0, force: float = 5.0, time: float = HOLD
-) -> World:
+    degrees: float = FOLDED, away: Any = (0.0, 0.0, 0.0), beside: float = 0.0, force: float = 5.0, time: float = HOLD,
+    deep: float = DEEP,
+) -> World:  # fmt: skip
     """Both tools where the oracle brings them, and the flap turned up by an angle.
 
     Args:
         degrees: the flap's angle.
         away: by which the second tool is off the lesion, m.
-        beside: by which the first tool is off the edge, m.
+        beside: by which the first tool is off the edge along the way in which its jaw opens, m.
         force: on the tissue, N.
         time: for which the lesion has been touched, s.
+        deep: how far the first tool's tip is past the edge, m.
     """
     task: Any = env().task
     flap, nodes = task.flap, turned(degrees)
     point, grip = task.tables["points"][ROW], int(task.tables["grips"][ROW])
-    first = flap.folded(flap.pinching(flap.edge_of(flap.rest)[[grip]], DEEP), np.radians(degrees))
-    arms = {"psm_0": view("psm_0", moved(first, [0.0, beside, 0.0])[0]),
+    first = flap.pinching(flap.edge_of(flap.rest)[[grip]], deep)
+    first = moved(first, beside * first[:, :3, 1])[0]
+    turn = turn_about(np.cross(flap.outward, [0.0, 0.0, 1.0]), np.radians(degrees))
+    first[:3] = np.column_stack([turn @ first[:3, :3], flap.hinge + turn @ (first[:3, 3] - flap.hinge)])
+    arms = {"psm_0": view("psm_0", first),
             "psm_1": view("psm_1", moved(task._touching(point[None], 0.0005), away)[0])}  # fmt: skip
     tissue = SimpleNamespace(position=nodes, tissue_force=np.float32(force), torn=np.bool_(False))
     best = Best(*map(np.float32, (0.03, 0.0, 0.0, 0.0, 0.05)))  # type: ignore[arg-type]
@@ -82,6 +87,8 @@ def world(
         ({"degrees": HANGS}, False),  # the flap is pinched, but hangs
         ({"degrees": 60.0}, False),  # lifted, but in the way
         ({"beside": 0.02}, False),  # nobody holds it
+        ({"deep": 0.0}, False),  # a tip pokes at its edge
+        ({"beside": 0.004}, False),  # a finger bears its edge from below
         ({"away": (0.0, 0.0, 0.003)}, False),  # the tip is above the lesion
         ({"away": (0.003, 0.0, 0.0)}, False),
         ({"force": OVERLOAD + 1}, False),
