@@ -236,7 +236,7 @@ class Task(BaseTask):
             edge[grip],
         )
 
-    def _tool(self, world: World, agent: str) -> tuple[Array, Array]:
+    def _tool(self, world: World, agent: str) -> tuple[Any, Any]:
         """Return the place, m, [3], and the axes, [3, 3], of an arm's tool tip in the world."""
         mount, view = self.scene.mounts[agent], world.arms[agent]
         turn = _f32(mount.rotation)
@@ -561,7 +561,7 @@ def _length(way: Array) -> Array:
     return jnp.sqrt(jnp.sum(way * way))
 
 
-def _gap(points: Array, start: Array, end: Array) -> Array:
+def _gap(points: Any, start: Any, end: Any) -> Array:
     """Return the least distance of points [n, 3] from a straight line between two others, m, []."""
     way, off = end - start, points - start
     share = jnp.clip(off @ way / (way @ way + 1e-12), 0.0, 1.0)

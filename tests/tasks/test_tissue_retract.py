@@ -151,8 +151,8 @@ def test_progress_is_rewarded_once_and_only_while_the_flap_is_held() -> None:
 
 def test_a_touch_that_is_broken_begins_anew() -> None:
     task: Any = env().task
-    for change, left in (({}, 0.12), ({"away": (0.0, 0.0, 0.01)}, 0.0)):
-        seen = world(**change, time=0.1)
+    for off, left in ((0.0, 0.12), (0.01, 0.0)):
+        seen = world(away=(0.0, 0.0, off), time=0.1)
         seen = seen._replace(goal=task.advance(seen.goal, 0.02))
         assert float(task.remember(seen).touched) == pytest.approx(left, abs=1e-6)
 
