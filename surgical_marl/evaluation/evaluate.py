@@ -20,6 +20,7 @@ from surgical_marl.envs.infos import ERRORS
 from surgical_marl.evaluation.goal_set import check_same, describe_goals, episode_seed, goal_hash, read_goals
 from surgical_marl.evaluation.interval import interval
 from surgical_marl.evaluation.metrics import (
+    BITES,
     DROP,
     LAST,
     PEAK,
@@ -53,7 +54,7 @@ MEASURES = ("error", "held", "squared", "distance", "center", "success", "collid
 MAX_BATCH = 1024
 """Episodes run at once; make the environment with num_envs=min(episodes, MAX_BATCH)."""
 INFOS = ("success", "collision", "min_distance")
-KEPT = (*ERRORS, *INFOS, *LAST, *VIEWED, *TRAVEL, *PEAK, DROP, SEARCHING)
+KEPT = (*ERRORS, *INFOS, *LAST, *BITES, *VIEWED, *TRAVEL, *PEAK, DROP, SEARCHING)
 """Names of infos that metrics are computed from, besides those that begin like `TERMS` and `STAGE`."""
 
 

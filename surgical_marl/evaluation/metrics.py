@@ -39,7 +39,13 @@ SEARCHING = "searching"
 """True if an endoscope may still look for the tools, in `infos` of tasks with such a search."""
 TRAVEL = {"camera_travel": ("camera_travel_mm", 1000.0)}
 """Infos of how far something moved in a step, whose sum counts, likewise."""
-PEAK = {"contact_force": ("peak_force_n", 1.0)}
+BITES = {
+    "entry_error": ("entry_error_mm", 1000.0),
+    "exit_error": ("exit_error_mm", 1000.0),
+    "bite_depth": ("bite_depth_mm", 1000.0),
+}
+"""Infos of a needle in tissue whose value after the last step counts, likewise; of all episodes, their median."""
+PEAK = {"contact_force": ("peak_force_n", 1.0), "tissue_force": ("max_tissue_force_n", 1.0)}
 """Infos whose largest value of all steps counts, likewise."""
 STILL = 1e-3
 """A tip that moved less than this, in m, has no smoothness, because its motion is noise."""
@@ -67,8 +73,8 @@ class Trajectory(NamedTuple):
     center: np.ndarray
     """[T, E, A], distance of the shaft from its remote center at the start of each step, m; NaN without one."""
     terms: Mapping[str, np.ndarray]
-    """Reward terms, costs, stages, `SEARCHING` and what `LAST`, `VIEWED`, `TRAVEL` and `PEAK` have, of each step, by
-    their names in `infos`, [T, E, A]; NaN for an agent that has none."""
+    """Reward terms, costs, stages, `SEARCHING` and what `LAST`, `BITES`, `VIEWED`, `TRAVEL` and `PEAK` have, of each
+    step, by their names in `infos`, [T, E, A]; NaN for an agent that has none."""
 
 
 class Metric(NamedTuple):
@@ -97,7 +103,7 @@ def measure(trajectory: Trajectory, dt: float, following: bool) -> dict[str, np.
         `center`, `path` of the tip. Also `collided`; `time` from which on it is not `missed`, s, `smoothness`, and
         `action_change`, the root mean square in steps that begin at the goal, NaN where undefined; the mean of each of
         the `terms`, over the steps that count of those in `VIEWED`, NaN if there are none; at the last step of those in
-        `LAST`, over all steps together of `TRAVEL`, the largest of `PEAK`.
+        `LAST` and `BITES`, over all steps together of `TRAVEL`, the largest of `PEAK`.
     """
     lengths, error = trajectory.lengths[:, None], trajectory.error
     step = np.arange(1, len(error) + 1)[:, None, None]
@@ -138,14 +144,14 @@ def measure(trajectory: Trajectory, dt: float, following: bool) -> dict[str, np.
 def _reduced(name: str, values: np.ndarray, where: np.ndarray, final: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
     """Reduce steps to one number: their mean, unless the name asks for something else.
 
-    That is whether a stage was ever reached or there was a drop, the largest of `PEAK`, the last of `LAST`, or the sum
-    of `TRAVEL`.
+    That is whether a stage was ever reached or there was a drop, the largest of `PEAK`, the last of `LAST` and `BITES`,
+    or the sum of `TRAVEL`.
 
     Args:
         where: [T, E, 1], the steps that count.
         final: returns the values at the last steps.
     """
-    if name in LAST:
+    if name in LAST | BITES:
         return final(values)
     kept = np.where(where, values, 0.0)
     if name in TRAVEL:
@@ -185,6 +191,7 @@ def metrics(measures: Mapping[str, np.ndarray], following: bool) -> dict[str, Me
     for name, (title, unit) in (LAST | VIEWED | TRAVEL | PEAK).items():
         if name in measures:
             found[title] = Metric(unit * measures[name], mean_of_known, share=title.endswith("_rate"))
+    found |= {title: Metric(unit * measures[n], _median) for n, (title, unit) in BITES.items() if n in measures}
     return found | {
         name: Metric(values, mean_of_known, share=name.startswith(SHARES))
         for name, values in measures.items()
