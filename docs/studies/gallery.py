@@ -47,8 +47,10 @@ from surgical_marl.view.tracer import PLANE
 
 Picture = Any
 
-SMALL, LARGE, CLIP = (320, 240), (480, 360), (960, 540)
-"""Width and height of pictures, of an arm's portrait and of clips, pixels."""
+SMALL, LARGE, CLIP, WIDE = (320, 240), (480, 360), (480, 270), (960, 540)
+"""Width and height of pictures, of an arm's portrait, of clips, and of the clip on the first page, pixels."""
+FIRST = "needle_handover"
+"""The task on the first page."""
 COLUMNS = 4
 """Scenes in a row of the picture of all scenes, and cells in a row of the page."""
 FPS, SECONDS = 12.5, 6.0
@@ -92,7 +94,9 @@ def object_picture(name: str) -> Picture:
     lowest = min(float(data.geom_xpos[geom][2] - _reach(model, data, geom)) for geom in range(model.ngeom))
     white = Material(np.array([0.72, 0.74, 0.76]), CLOTH, int(PLAIN))
     ground = Extra(int(PLANE), (0.0, 0.0, 0.0), np.array([0.0, 0.0, lowest]), np.eye(3), white)
-    view = View(model.stat.center.tolist(), 1.5 * model.stat.extent, OBJECT_AZIMUTH, OBJECT_ELEVATION)
+    low, high = data.geom_xpos.min(0), data.geom_xpos.max(0)
+    far = 1.5 * model.stat.extent
+    view = View(((low + high) / 2).tolist(), far, OBJECT_AZIMUTH, OBJECT_ELEVATION)
     return Renderer(model, *SMALL, [ground], named(model, placed), skins(systems, model)).render(data, view)
 
 
@@ -107,7 +111,7 @@ def clip(task: str, path: Path) -> str:
     who, scene = player(task)
     settings = common_settings([who], {"task": task, "scene": scene, "goals": "training"})
     env = make_env(replace(settings, seed=0), 1, "numpy")
-    look = Look(size=CLIP, fps=FPS)
+    look = Look(size=WIDE if task == FIRST else CLIP, fps=FPS)
     shown = islice(pictures(env, Movers(env, who), look), round(FPS * SECONDS))
     write_video(path, shown, FPS)
     env.close()

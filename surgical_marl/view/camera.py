@@ -3,8 +3,8 @@
     view = best_view(scene)
     Renderer(scene.model).render(data, view)
 
-What matters are tool tips, the points that targets are drawn around, and objects. The directions are tried with the
-arms in several postures about home. The same scene always gives the same view.
+What matters are tool tips, the points that targets are drawn around, objects, thread and tissue. The directions are
+tried with the arms in several postures about home. The same scene always gives the same view.
 """
 
 from __future__ import annotations
@@ -155,6 +155,10 @@ def _moments(scene: Scene, places: Array) -> list[_Moment]:
     """Return the arms at home and in postures about it, with tool tips, targets and objects."""
     rng, model = np.random.default_rng(0), scene.model
     still = [*places, *(model.body(name).pos for name in scene.free_objects)]
+    for system in scene.systems.values():
+        if system.bars is not None:
+            nodes = system.bars.start
+            still += list(nodes[:: -(-len(nodes) // _PLACES)]) + list(nodes[[*nodes.argmin(0), *nodes.argmax(0)]])
     for mount in scene.mounts.values():
         steps = _AROUND * np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)])
         still += list(mount.position + (mount.workspace + steps) @ mount.rotation.T)

@@ -218,7 +218,16 @@ def test_an_endoscope_sees_nothing_of_the_stage_or_the_paint() -> None:
 
 
 @pytest.mark.parametrize(
-    "name", ["psm", "bimanual_star", "trimanual_psm_ecm", "bimanual_psm_needle", "trimanual_psm_ecm_pegs"]
+    "name",
+    [
+        "psm",
+        "bimanual_star",
+        "trimanual_psm_ecm",
+        "bimanual_psm_needle",
+        "trimanual_psm_ecm_pegs",
+        "bimanual_psm_tissue",
+        "psm_suture",
+    ],
 )
 def test_no_arm_hides_what_matters(name: str) -> None:
     scene = sm.load_scene(name)
@@ -229,6 +238,7 @@ def test_no_arm_hides_what_matters(name: str) -> None:
     points = np.array([*tips, *objects])
     eye, axes = view.pose()
     assert seen(scene.model, data, eye, points).all()
+    points = np.concatenate([points, *(bars.start for bars in scene.drawn.values())])
     local = (points - eye) @ axes
     assert (np.abs(local[:, :2] / -local[:, 2:]) < np.tan(np.radians(view.fovy / 2)) * np.array([4 / 3, 1])).all()
 
