@@ -20,7 +20,7 @@ from surgical_marl.engines.fused.engine import FusedEngine
 from surgical_marl.engines.fused.kernel_layout import Stage
 from surgical_marl.envs.env import Env
 
-HELD, SETTLE = 25, 50
+HELD, SETTLE = 25, 80
 """Control steps for which arms that go into tissue hold an action, and those before anything is timed."""
 MOTIONS = ("random", "into it")
 
@@ -49,13 +49,19 @@ def waited(device: str) -> float:
 
 def measured(engine: Any, drawn: list[Any], hold: int, steps: int) -> tuple[float, float]:
     """Return environment steps/s, and the share of environments in which something touches the tissue."""
-    for k in range(SETTLE):
-        engine.step(drawn[k // hold % len(drawn)])
     start = waited(engine.device)
     for k in range(steps):
         engine.step(drawn[k // hold % len(drawn)])
     rate, name = steps * engine.num_envs / (waited(engine.device) - start), next(iter(engine.env.scene.systems))
     return rate, float((engine.read(f".physics.{name}.force", "numpy") > 0).mean())
+
+
+def settled(engine: Any, drawn: list[Any], motion: str, rng: np.random.Generator) -> None:
+    """Bring episodes to times like those of a training: at random all, into tissue none that ends meanwhile."""
+    engine.reset(seed=0)
+    if motion == "random":
+        engine.write(".steps", rng.integers(0, engine.env.max_steps, engine.num_envs, dtype=np.int32))
+    measured(engine, drawn, 1 if motion == "random" else HELD, SETTLE)
 
 
 def stage_times(engine: Any, actions: Any, steps: int) -> dict[str, float]:
@@ -84,22 +90,26 @@ def report(scene: str, count: int, device: str, steps: int) -> int:
     """Print tables."""
     start, env = time.perf_counter(), Env("reach", scene)
     engine, rng = FusedEngine(env, count, device), np.random.default_rng(0)
-    engine.reset(seed=0)
     print(f"{count} environments on {device}, compiled in {time.perf_counter() - start:.1f} s")
     of = "a core" if device == "cpu" else "the GPU"
+    stages: dict[str, dict[str, float]] = {}
     print(f"\n| motion | environment steps/s of {of} | tissue touched in |\n|---|---|---|")
     for motion in MOTIONS:
-        drawn: list[Any] = [actions_of(motion, env, count, rng) for _ in range(4)]
+        drawn: list[Any] = [actions_of(motion, env, count, rng) for _ in range(64 if motion == "random" else 4)]
         if device == "cuda":
             import torch
 
             drawn = [{name: torch.from_numpy(own).cuda() for name, own in one.items()} for one in drawn]
+        settled(engine, drawn, motion, rng)
         rate, touched = measured(engine, drawn, 1 if motion == "random" else HELD, steps)
         print(f"| {motion} | {rate:,.0f} | {touched:.0%} |", flush=True)
-    if device == "cuda":
-        print("\n| stage | ms of a control step |\n|---|---|")
-        for name, seconds in stage_times(engine, drawn[0], 10).items():
-            print(f"| {name} | {1e3 * seconds:.3f} |")
+        if device == "cuda":
+            stages[motion] = stage_times(engine, drawn[0], 10)
+    if stages:
+        print("\n| stage, ms of a control step |", " | ".join(stages), "|")
+        print("|---" * (1 + len(stages)) + "|")
+        for name in stages[MOTIONS[0]]:
+            print(f"| {name} |", " | ".join(f"{1e3 * one[name]:.3f}" for one in stages.values()), "|")
     engine.close()
     return 0
 

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
+import pytest
 
 from surgical_marl.engines.fused import kernel
 from surgical_marl.engines.fused.arrays import make_arrays
@@ -35,6 +36,12 @@ struct { int x; } threadIdx = {0};
 def has_clang() -> bool:
     """Return whether Warp can compile for a CPU: some builds of it have no Clang."""
     return bool(kernel.wp._src.context.runtime.llvm)
+
+
+DEVICES = [
+    pytest.param("cpu", marks=pytest.mark.skipif(not has_clang(), reason="needs Warp's compiler for a CPU")),
+    pytest.param("cuda", marks=pytest.mark.skipif(not kernel.has_cuda(), reason="needs a CUDA device")),
+]
 
 
 class Laid(NamedTuple):

@@ -12,7 +12,7 @@ from surgical_marl.physics.systems.system import Ends
 from surgical_marl.physics.systems.tissue import TissueState
 from surgical_marl.physics.systems.tissue_step import TissueStep
 from surgical_marl.scenes.channel_file import ChannelFile
-from tests.helpers.block_kernels import run_block
+from tests.helpers.block_kernels import DEVICES, run_block
 from tests.helpers.needle_bench import (
     ARC,
     DT,
@@ -28,7 +28,7 @@ from tests.helpers.needle_bench import (
     straight,
     turning,
 )  # fmt: skip
-from tests.physics.test_tissue_step import DEVICES, close, shaken, touched
+from tests.physics.test_tissue_step import close, shaken, touched
 
 SET = ChannelFile(puncture=0.2, cutting=0.05)
 TISSUE = sheet((PIN, ARC), SET)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -14,13 +15,16 @@ import yaml
 
 import surgical_marl as sm
 from surgical_marl.envs.batch import BatchedEnv
+from surgical_marl.physics.contact.node_balls import NodeBalls
 from surgical_marl.physics.contact.part_detection import PartDetection, Scenery
 from surgical_marl.physics.contact.shapes import Plate, Segments
 from surgical_marl.physics.systems.brick import CORNERS
 from surgical_marl.physics.systems.brick_solve import Nodes
+from surgical_marl.physics.systems.system import Ends, Shapes
 from surgical_marl.physics.systems.tissue import SKIN, Tissue, TissueState
 from surgical_marl.robots.spec import PAD_GROUP
 from surgical_marl.scenes.objects import Surface
+from tests.helpers.block_kernels import DEVICES, run_block
 
 CELLS, SIZE, DT = (6, 2, 1), (0.03, 0.01, 0.005), 2.5e-3
 PADS = np.array([0.006, 0.02]), 0.0006
@@ -121,24 +125,58 @@ def test_pads_that_close_crush_tissue_but_do_not_pass_through_it() -> None:
     assert seen.normal[-1] / 2 > 5  # on each pad, N: harder than a jaw holds a needle
 
 
+def bent(tissue: Tissue, rng: np.random.Generator) -> tuple[Scenery, Shapes]:
+    """A sheet that is bent over a plate and a capsule."""
+    noise = rng.normal(size=(2, *tissue.rest.shape)).astype(np.float32)
+    nodes = Nodes(jnp.asarray(tissue.rest + 1e-3 * noise[0]), jnp.asarray(0.1 * noise[1]))
+    shapes = tissue.shapes(tissue.start(jnp.zeros((0, 3)))._replace(nodes=nodes))
+    at = jnp.asarray(rng.uniform(0, SIZE, (2, 3)) + 0.004 * np.eye(3)[2], jnp.float32)
+    plates = Plate(at[:1], jnp.eye(3)[None], jnp.full((1, 2), 0.003), jnp.full(1, 0.001))
+    rods = Segments(at[1:], at[1:] + 0.01, jnp.full(1, 0.001))
+    return Scenery(plates, rods, jnp.full(2, 2e-4)), shapes
+
+
+COUNTS = {"pads": 1, "links": 1, "objects": 0, "plates": 0, "rods": 0}
+
+
 def test_clusters_leave_out_no_point_that_is_near() -> None:
-    """Of a sheet that is bent over a plate and a capsule."""
-    tissue = strip(fixed=())
-    rng, counts = np.random.default_rng(0), {"pads": 1, "links": 1, "objects": 0, "plates": 0, "rods": 0}
-    detection, found = PartDetection(counts, [tissue.surface] * 2, tissue.contacts), 0
+    tissue, rng, found = strip(fixed=()), np.random.default_rng(0), 0
+    detection = PartDetection(COUNTS, [tissue.surface] * 2, tissue.contacts)
     for _ in range(4):
-        noise = rng.normal(size=(2, *tissue.rest.shape)).astype(np.float32)
-        nodes = Nodes(jnp.asarray(tissue.rest + 1e-3 * noise[0]), jnp.asarray(0.1 * noise[1]))
-        shapes = tissue.shapes(tissue.start(jnp.zeros((0, 3)))._replace(nodes=nodes))
-        at = jnp.asarray(rng.uniform(0, SIZE, (2, 3)) + 0.004 * np.eye(3)[2], jnp.float32)
-        plates = Plate(at[:1], jnp.eye(3)[None], jnp.full((1, 2), 0.003), jnp.full(1, 0.001))
-        rods = Segments(at[1:], at[1:] + 0.01, jnp.full(1, 0.001))
-        scenery = Scenery(plates, rods, jnp.full(2, 2e-4))
+        scenery, shapes = bent(tissue, rng)
         one, other = (detection.find(scenery, own, [], [], DT) for own in (shapes, shapes._replace(clusters=None)))
         assert one.total == other.total and one.left_out == other.left_out
         for x, y in zip(*map(jax.tree.leaves, (one.rows, other.rows)), strict=True):
             np.testing.assert_allclose(x[: one.total], y[: one.total], atol=1e-6)
         found += int(one.total)
+    assert found > 20
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("kinds", [("pads", "links"), ("links", "plates"), ("pads", "rods")])
+def test_a_block_of_threads_finds_the_same(kinds: tuple[str, str], device: str) -> None:
+    """Of shapes that move and that do not, with room for all of them and for some."""
+    tissue, rng, found = strip(fixed=()), np.random.default_rng(0), 0
+    counts = {name: int(name in kinds) for name in COUNTS}
+    for room in (tissue.contacts, 5):
+        detection = PartDetection(counts, [replace(tissue.surface, stiffness=k) for k in (1e3, 2e3)], room)
+
+        def find(scenery: Scenery, balls: NodeBalls, detection: PartDetection = detection) -> Ends:
+            return detection._find_by_block(scenery, balls, DT)
+
+        for _ in range(3):
+            scenery, shapes = bent(tissue, rng)
+            assert shapes.clusters
+            balls, expected = shapes.clusters.nodes, detection.find(scenery, shapes, [], [], DT)
+            of = run_block(device, lambda *x, balls=balls: find(x[0], balls._replace(position=x[1], velocity=x[2])),
+                           scenery, balls.position, balls.velocity)  # fmt: skip
+            total = int(expected.total)
+            assert [of[name] for name in ("moving", "total", "left_out")] == [expected.moving, total, expected.left_out]
+            for name, values in expected.rows._asdict().items():
+                if values is not None:
+                    atol = 2e-5 if name == "normal" else 2e-8
+                    np.testing.assert_allclose(of[f"rows.{name}"][:total], values[:total], rtol=1e-5, atol=atol)
+            found += total
     assert found > 20
 
 

@@ -18,7 +18,7 @@ from surgical_marl.physics.systems.brick_solve import Nodes
 from surgical_marl.physics.systems.system import End, Ends
 from surgical_marl.physics.systems.tissue import Tissue
 from surgical_marl.physics.systems.tissue_step import Held, TissueStep
-from tests.helpers.block_kernels import cuda_of, has_clang, run_block
+from tests.helpers.block_kernels import DEVICES, cuda_of, run_block
 from tests.physics.test_tissue_contact import DT, scene_file, strip
 
 ROOM, CONTACTS = 12, 7
@@ -28,12 +28,6 @@ SHEETS = {
     "holes": strip(present=HOLES, size=(0.015, 0.012, 0.008), springs=(("front", 1e6),)),
     "loose": strip(fixed=(), springs=(("left", 1e4),), present=(((True, True),) * 2,) * 3),
 }
-
-
-DEVICES = [
-    pytest.param("cpu", marks=pytest.mark.skipif(not has_clang(), reason="needs Warp's compiler for a CPU")),
-    pytest.param("cuda", marks=pytest.mark.skipif(not kernel.has_cuda(), reason="needs a CUDA device")),
-]
 
 
 @cache

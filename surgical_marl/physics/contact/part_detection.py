@@ -11,6 +11,7 @@ import numpy as np
 from jax import Array
 
 from surgical_marl.physics.contact.broadphase import Ball, size
+from surgical_marl.physics.contact.node_balls import NodeBalls, found_by_block
 from surgical_marl.physics.contact.shapes import Plate, Points, Segments, between_segments, in_frame
 from surgical_marl.physics.systems.system import End, Ends, Shapes, Spot
 from surgical_marl.physics.tree_utils import Listed, Tree, picked, put, room, row_of
@@ -106,6 +107,10 @@ class PartDetection:
             dt: duration of a step, s.
             begun: contacts with other systems, which come first of all; in a list made by `nothing`.
         """
+        balls = shapes.clusters and shapes.clusters.nodes
+        alone = begun is None and not first and not last
+        if balls is not None and alone and len(scenery.plates.radius) and len(scenery.capsules.radius):
+            return self._find_by_block(scenery, balls, dt)
         pairs = self._near(scenery, shapes, dt)
         found = self.nothing() if begun is None else begun
         for tie in first:
@@ -122,6 +127,18 @@ class PartDetection:
         return Ends(
             jax.tree.map(lambda x: x[:-1], found.rows), found.moving, jnp.minimum(found.total, self._room), left_out
         )
+
+    def _find_by_block(self, scenery: Scenery, balls: NodeBalls, dt: Any) -> Ends:
+        numbers = {
+            "SHAPES": self._shapes, "FINGERS": int(self._starts["links"]), "PLATES": int(self._starts["plates"]),
+            "RODS": int(self._starts["rods"]), "ROOM": self._room, "NEAREST": self._nearest, "NEAR": NEAR,
+            "AHEAD": AHEAD, "RIM": RIM,
+        }  # fmt: skip
+
+        def find(scenery: Scenery, shapes: Shapes, dt: Any) -> Ends:
+            return self.find(scenery, shapes, [], [], dt)
+
+        return found_by_block(find, scenery, balls, (self._stiffness, self._sliding), numbers, dt)
 
     def visited(self, scenery: Scenery, shapes: Shapes, dt: Any) -> Array:
         """Return whether any shape that moves may touch a part in the step, [] bool."""

@@ -22,7 +22,7 @@ from surgical_marl.physics.contact.part_detection import NOWHERE, PartDetection,
 from surgical_marl.physics.contact.shapes import Plate, Segments
 from surgical_marl.physics.contact.skin_detection import add_skin_contacts, near_skin
 from surgical_marl.physics.contact.spring_contact import each
-from surgical_marl.physics.solver.cholesky import cholesky, solve_factored
+from surgical_marl.physics.solver.cholesky import FULL, cholesky, solve_factored
 from surgical_marl.physics.systems.arms import ArmForces
 from surgical_marl.physics.systems.rigid_motion import Bodies, point_jacobian, rotation
 from surgical_marl.physics.systems.system import (
@@ -211,23 +211,14 @@ class Coupling:
         def jacobian(row: Array, end: End) -> Array:
             return self._jacobian(joints, arms[end.shape], moved[end.shape], end.place).T
 
-        def loaded(arm: Array, pushed: Array, columns: Array) -> tuple[Array, Array]:
-            def column(j: Array) -> Array:
-                moves = each(ends, lambda row, end: columns[row, j] * (arms[end.shape] == arm), moving=True)
-                return self._sum(ends, columns, self._system.yielding(response, ends, moves, dt), arm)
-
-            block = jax.lax.map(column, jnp.arange(m, dtype=jnp.int32))
-            return block, pushed + block @ expected[arm]
-
         def on_all(forces: ArmForces) -> ArmForces:
             columns = each(ends, jacobian, moving=True)
 
             def of_arm(arm: Array, forces: ArmForces) -> ArmForces:
-                pushed = self._sum(ends, columns, response.force, arm)
-                none = jnp.zeros((m, m)), jnp.zeros(m)
-                touched = (pushed != 0).any()
-                block, pushed = jax.lax.cond(touched, lambda: loaded(arm, pushed, columns), lambda: none)
-                lower = block[np.tril_indices(m)]
+                pushed, block = self._felt(
+                    response, ends, lambda row, end: (arms[end.shape] == arm, columns[row]), m, dt
+                )
+                lower, pushed = block[np.tril_indices(m)], pushed + block @ expected[arm]
                 return forces._replace(  # a force is added to an array in place, outside of a branch
                     mass=forces.mass.at[arm].add(lower, mode="promise_in_bounds"),
                     implicit=forces.implicit.at[arm].add(lower, mode="promise_in_bounds"),
@@ -238,16 +229,52 @@ class Coupling:
 
         return jax.lax.cond(ends.moving > 0, on_all, lambda forces: forces, forces) if a else forces
 
-    def _sum(self, ends: Ends, columns: Array, forces: Array, arm: Array) -> Array:
-        """Return the generalised force on one arm's joints, [m], by those on the ends, N, [c, 3]."""
-        arms = jnp.asarray(self.arm)
+    def _felt(
+        self, response: Response, ends: Ends, column: Callable[[Array, End], tuple[Array, Array]], m: int, dt: Any
+    ) -> tuple[Array, Array]:
+        """Return the force on the m coordinates of a body or an arm, [m], and how it falls as they accelerate, [m, m].
 
-        def add(row: Array, total: Array) -> Array:
-            mine = arms[ends.rows.shape[row]] == arm
-            return total + jnp.where(mine, columns[row] @ forces[row], 0.0)
+        Args:
+            response: of the system.
+            ends: of its contacts.
+            column: takes the number of a contact and its end; returns whether the end is on it, and the end's motion
+                by each coordinate, [m, 3].
+            m: number of coordinates.
+            dt: duration of a step, s.
+        """
 
-        found: Array = jax.lax.fori_loop(0, ends.moving, add, jnp.zeros(columns.shape[1]))
-        return found
+        def total(forces: Array) -> Array:
+            def add(row: Array, total: Array) -> Array:
+                mine, own = column(row, row_of(ends.rows, row))
+                return total + jnp.where(mine, own @ forces[row], 0.0)
+
+            found: Array = jax.lax.fori_loop(0, ends.moving, add, jnp.zeros(m))
+            return found
+
+        def by_ends(falls: Array) -> Array:
+            """Where each end's force depends on its own motion alone."""
+
+            def add(row: Array, block: Array) -> Array:
+                mine, own = column(row, row_of(ends.rows, row))
+                return block + jnp.where(mine, own @ (dt * dt * falls[row][FULL]) @ own.T, 0.0)
+
+            found: Array = jax.lax.fori_loop(0, ends.moving, add, jnp.zeros((m, m)))
+            return found
+
+        def by_coordinates() -> Array:
+            def along(j: Array) -> Array:
+                def moves(row: Array, end: End) -> Array:
+                    mine, own = column(row, end)
+                    return own[j] * mine
+
+                return total(self._system.yielding(response, ends, each(ends, moves, moving=True), dt))
+
+            found: Array = jax.lax.map(along, jnp.arange(m, dtype=jnp.int32))
+            return found
+
+        pushed, falls = total(response.force), response.falls
+        block = by_coordinates if falls is None else lambda: by_ends(falls)
+        return pushed, jax.lax.cond((pushed != 0).any(), block, lambda: jnp.zeros((m, m)))
 
     def on_bodies(
         self, masses: Array, free: Array, response: Response, ends: Ends, bodies: Bodies, dt: Any
@@ -260,26 +287,13 @@ class Coupling:
         def of_body(row: tuple[Array, Array, Array, Bodies]) -> tuple[Array, Array, Array]:
             number, mass, free, body = row
 
-            def lever(end: End) -> Array:
-                return point_jacobian(end.place - body.position)
+            def column(row: Array, end: End) -> tuple[Array, Array]:
+                return owner[end.shape] == number, point_jacobian(end.place - body.position).T
 
-            def total(forces: Array) -> Array:
-                def add(row: Array, total: Array) -> Array:
-                    end = row_of(ends.rows, row)
-                    return total + jnp.where(owner[end.shape] == number, forces[row] @ lever(end), 0.0)
-
-                found: Array = jax.lax.fori_loop(0, ends.moving, add, jnp.zeros(6))
-                return found
-
-            pushed = total(response.force)
+            pushed, block = self._felt(response, ends, column, 6, dt)
             touched = (pushed != 0).any()
 
             def loaded() -> tuple[Array, Array]:
-                def column(unit: Array) -> Array:
-                    moves = each(ends, lambda row, end: (lever(end) @ unit) * (owner[end.shape] == number), moving=True)
-                    return total(self._system.yielding(response, ends, moves, dt))
-
-                block = jax.lax.map(column, jnp.eye(6))
                 force = mass @ free + pushed + block @ body.acceleration
                 return mass + block, solve_factored(cholesky(mass + block), force)
 

@@ -36,6 +36,8 @@ class Clusters(NamedTuple):
     """Largest speed of any part, m/s, []."""
     part: Callable[[Array], tuple[Array, Array]]
     """Takes the number of a part, a sphere; returns its centre, m, [3], and speed, m/s: only of parts that are near."""
+    nodes: Any = None
+    """`NodeBalls` that make all of the above, by which a GPU finds contacts in a stage; None where it does not."""
 
 
 class Shapes(NamedTuple):
@@ -145,6 +147,9 @@ class Response(NamedTuple):
     """Whatever `yielding` and `apply` need."""
     left_out: Any = 0
     """Number of contacts with itself that found no room, []."""
+    falls: Array | None = None
+    """By how much the force on each end falls as that end moves, N/m: lower halves, [c, 6]. None if the motion of one
+    end changes the forces on others, as `yielding` says then."""
 
 
 class Skin(NamedTuple):

@@ -17,6 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from surgical_marl.physics.contact.node_balls import NodeBalls
 from surgical_marl.physics.contact.spring_contact import Stretches, each, none, pushes, recall, remember
 from surgical_marl.physics.systems.brick import Brick
 from surgical_marl.physics.systems.brick_grid import BrickGrid, SurfacePoints
@@ -27,7 +28,6 @@ from surgical_marl.physics.systems.needle import Needle
 from surgical_marl.physics.systems.soft import Soft
 from surgical_marl.physics.systems.system import (
     Bars,
-    Clusters,
     End,
     Ends,
     Followed,
@@ -219,33 +219,7 @@ class Tissue(Soft, SkinnedSystem):
 
     def shapes(self, state: TissueState) -> Shapes:
         """Return a ball at each surface point, under the surface."""
-        (position, velocity), points = state.nodes, self.points
-        nodes, weights, inward = (jnp.asarray(x) for x in points[:3])
-        ball = SKIN * self.grid.cell[2]
-
-        def under(node: Array, inward: Array) -> Array:
-            return (1 - SKIN) * position[node] + SKIN * position[node + inward]
-
-        def part(number: Array) -> tuple[Array, Array]:
-            own, share = nodes[number], weights[number]
-            moves = share @ velocity[own]
-            return share @ under(own, inward[number]), jnp.sqrt(moves @ moves)
-
-        def around(face: Any) -> tuple[Array, Array]:
-            own, inward = face
-            corners = under(own, inward)
-            centre = jnp.sum(corners, 0) / 4
-            off = corners - centre
-            return centre, jnp.sqrt(jnp.max(jnp.sum(off * off, 1))) + ball
-
-        def faster(most: Array, v: Array) -> tuple[Array, None]:
-            return jnp.maximum(most, v @ v), None
-
-        fastest, _ = jax.lax.scan(faster, jnp.float32(0.0), velocity)
-        centre, radius = jax.lax.map(around, (jnp.asarray(points.faces), inward[points.first[:-1]]))
-        clusters = Clusters(centre, radius, points.first, jnp.sqrt(fastest), part)
-        centre, speed = jax.lax.map(part, jnp.arange(len(nodes), dtype=jnp.int32))
-        return Shapes(centre, centre, np.full(len(nodes), ball, np.float32), speed, clusters)
+        return NodeBalls(*state.nodes, self.points, SKIN, SKIN * float(self.grid.cell[2])).shapes()
 
     def skin(self, state: TissueState) -> Skin:
         return Skin(*state.nodes)
@@ -258,7 +232,7 @@ class Tissue(Soft, SkinnedSystem):
         ends = ends if self.channels else self.rubbed(ends)
         ends, held = recall(state.stretches, ends, len(self.points.nodes)), self._held(state, ends)
         answer = self._step(dt).respond(state.nodes, held, ends, load)
-        return Response(-answer.force, Solved(answer, held, ends))
+        return Response(-answer.force, Solved(answer, held, ends), falls=answer.falls)
 
     def displacements(self, response: Response) -> Array:
         found: Array = response.solved.answer.shift
