@@ -140,7 +140,7 @@ class BrickSolver:
 
         rows = (*self._constants, state.position, jnp.asarray(self.support.rest), state.velocity)
         force, block, inertia, guess = jax.lax.map(begin, rows)
-        sums: tuple[Array, ...] = force, block, jnp.zeros((grid.nodes, 9))
+        sums: tuple[Array, Array, Array] = force, block, jnp.zeros((grid.nodes, 9))
         sums, cells = jax.lax.scan(add, sums, jnp.asarray(grid.first))
         return Linear(cells, *sums, inertia, guess)
 
