@@ -259,7 +259,7 @@ def test_a_jaw_gathers_tissue_lifts_it_and_holds_it_for_ten_seconds(tmp_path: Pa
                 return
 
     go(12, 0.0, 1.0)
-    go(60, 0.25, 1.0, force=0.2)
+    go(60, 0.25, 1.0, force=0.25)
     go(60, 0.0, -1.0)
     go(14, -0.2, -1.0)
     go(100, 0.0, -1.0)

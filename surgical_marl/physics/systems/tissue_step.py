@@ -4,7 +4,7 @@
     moved = step.move(nodes, held, ends, answer, pushed)   # the nodes after the step
 
 Functions of JAX are the reference. `tissue_respond.cu` and `tissue_move.cu` are the same in CUDA, with `brick.cu` for
-an element and `brick_block.cu` for what a block's threads share.
+an element, `brick_solve.cu` for conjugate gradients, and `brick_block.cu` for what a block's threads share.
 """
 
 from __future__ import annotations
@@ -132,7 +132,7 @@ class TissueStep:
     def _stage(self, kernel: str, reference: Callable[..., R], held: Held) -> Callable[..., R]:
         grid, (rows, q) = self.solver.grid, held.nodes.shape
         threads = min(MOST_THREADS, 32 * -(-grid.nodes // 64))
-        shared = 4 * (12 * grid.nodes + PAD * len(grid.first) + rows * (12 + 3 * q)) + 2 * grid.nodes + 512
+        shared = 4 * (12 * grid.nodes + PAD * len(grid.first) + rows * (12 + 3 * q)) + 2 * grid.nodes + 640
         if shared > MOST_SHARED:
             return reference
         return block_stage(reference, self.cuda(kernel, held), threads, f"tissue_{kernel}")
