@@ -61,8 +61,9 @@ HOLD, SHORT = 0.2, 0.005
 """Time for which it has to, s, and by how much less it may be, as single steps are added up."""
 FELT = 0.3
 """Least force on tissue that is pinched, N."""
-BETWEEN = np.array([[-0.005, -0.0035, -0.010], [0.005, 0.0035, -0.0005]])
-"""Box in the tool's frame in which a place of the edge is between the fingers, m: a closed jaw has no room for it."""
+BETWEEN = np.array([[-0.005, -0.004, -0.010], [0.005, 0.004, 0.001]])
+"""Box in the tool's frame in which a place of the edge is between the fingers, m: a jaw that closes and folds it
+back moves it to a side and towards the tip."""
 LIFTED = 0.3
 """Angle about its side by which the edge is turned up once it is lifted, rad."""
 HIGHEST = 2.4

@@ -87,8 +87,8 @@ def world(
         ({"degrees": HANGS}, False),  # the flap is pinched, but hangs
         ({"degrees": 60.0}, False),  # lifted, but in the way
         ({"beside": 0.02}, False),  # nobody holds it
-        ({"deep": 0.0}, False),  # a tip pokes at its edge
-        ({"beside": 0.004}, False),  # a finger bears its edge from below
+        ({"deep": -0.002}, False),  # the jaw closes before its edge
+        ({"beside": 0.006}, False),  # a finger bears its edge from below
         ({"away": (0.0, 0.0, 0.003)}, False),  # the tip is above the lesion
         ({"away": (0.003, 0.0, 0.0)}, False),
         ({"force": OVERLOAD + 1}, False),
