@@ -48,26 +48,32 @@ def axis_of(needle: Needle) -> np.ndarray:
     return np.cross(needle.along, needle.inward)
 
 
+def centre_of(needle: Needle) -> np.ndarray:
+    """Return the centre of a needle's arc, in its frame, m, [3]."""
+    return np.asarray(np.array(needle.tip) + np.array(needle.inward) / needle.bend)
+
+
 def driven(needle: Needle, poses: np.ndarray, angle: float | np.ndarray) -> np.ndarray:
     """Return poses [n, 4, 4] of needles that are driven on along their arcs by angles, rad, [n] or one for all."""
     return np.asarray(poses @ _turn(needle, angle))
 
 
-def held_at(needle: Needle, behind: np.ndarray, lean: np.ndarray, side: np.ndarray, beyond: ArrayLike) -> np.ndarray:
+def held_at(needle: Needle, behind: np.ndarray, lean: np.ndarray, beyond: ArrayLike) -> np.ndarray:
     """Return poses [n, 4, 4], in the needle's frame, of tools that point along the axis of its turn and grip it.
+
+    Their x axes are towards the tip.
 
     Args:
         needle: the centre line.
         behind: lengths from the tip to the places that are gripped, m, [n].
         lean: angles by which tools lean outwards, about the wire, rad, [n].
-        side: 1 where a tool's x axis is towards the tip, -1 where it is towards the tail, [n].
         beyond: how far the tool tips are past the wire, m, [n] or one for all.
     """
     back = _turn(needle, -needle.bend * behind)
     along, inward, axis = (back[:, :3, :3] @ one for one in _axes(needle).T)
     place = back[:, :3, :3] @ needle.tip + back[:, :3, 3]
     pointing = np.cos(lean)[:, None] * axis + np.sin(lean)[:, None] * inward
-    return tool_poses(place, side[:, None] * along, pointing, np.broadcast_to(beyond, len(place)))
+    return tool_poses(place, along, pointing, np.broadcast_to(beyond, len(place)))
 
 
 def reaching(needle: Needle, poses: np.ndarray, place: np.ndarray, normal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -107,6 +113,6 @@ def _turn(needle: Needle, angle: float | np.ndarray) -> np.ndarray:
     turn[:, 0, 1] = -turn[:, 1, 0]
     turns = np.tile(np.eye(4), (len(angle), 1, 1))
     turns[:, :3, :3] = axes @ turn @ axes.T
-    centre = np.array(needle.tip) + np.array(needle.inward) / needle.bend
+    centre = centre_of(needle)
     turns[:, :3, 3] = centre - turns[:, :3, :3] @ centre
     return turns

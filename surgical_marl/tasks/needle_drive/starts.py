@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from surgical_marl.robots.rotation import quaternion, turned
-from surgical_marl.tasks.base.grasp_poses import frames, joints_at, moved
+from surgical_marl.tasks.base.grasp_poses import frames, joints_at, moved, tool_of
 from surgical_marl.tasks.base.resting_poses import resting_poses
 from surgical_marl.tasks.base.workspace import choose
-from surgical_marl.tasks.needle_drive.path import axis_of, driven, entry_poses, held_at, reaching
+from surgical_marl.tasks.needle_drive.path import axis_of, centre_of, driven, entry_poses, held_at, reaching
 
 if TYPE_CHECKING:
     from surgical_marl.physics.systems.needle import Needle
@@ -35,6 +35,8 @@ HIGH, BESIDE, TURNED = (0.008, 0.02), 0.008, 10.0
 axis by up to this, degrees."""
 LOOSE = 0.004
 """Greatest distance of a needle on the pad from its place in the scene, m."""
+TAIL = "tail"
+"""The needle's site that a thread is tied to."""
 OPEN = 0.085
 """Position of a jaw that is about to close on the wire, rad."""
 SHARES = np.linspace(0.0, 1.0, 5)
@@ -128,7 +130,10 @@ def draw_starts(
         marks[:, 1] = (tips - np.array(wound.tissue.position)) @ turn
         behind = needle.length - BACK * rng.uniform(2 / 3, 4 / 3, rows)
         lean = np.zeros(rows) if picks else rng.uniform(-TILT, TILT, rows)
-        held = held_at(needle, behind, lean, rng.choice([-1.0, 1.0], rows), PRESS)
+        held = held_at(needle, behind, lean, PRESS)
+        tools = driven(needle, entries, sweep / 2) @ held
+        turned_over = tools[:, :3, 0] @ tool_of(mount, mount.arm.home)[:3, 0] < 0  # which the roll would have to make
+        held[:, :3, :2] *= np.where(turned_over, -1.0, 1.0)[:, None, None]
         starts = _lying(scene, item, needle, rows, rng) if picks else _in_jaw(needle, entries, rng)
         first, good = joints_at(mount, starts @ held)
         q = first
@@ -162,9 +167,19 @@ def _in_jaw(needle: Needle, entries: np.ndarray, rng: np.random.Generator) -> np
 
 
 def _lying(scene: Scene, item: str, needle: Needle, rows: int, rng: np.random.Generator) -> np.ndarray:
-    """Return poses [rows, 4, 4] of the needle on its pad, turned so that a tool from above points as it drives."""
-    poses = frames(*resting_poses(scene, item, 3 * rows, scene.objects[item].position[:2], LOOSE, rng))
-    return poses[(poses[:, :3, :3] @ axis_of(needle))[:, 2] < 0][:rows]
+    """Return poses [rows, 4, 4] of the needle on its pad, turned so that a tool from above points as it drives.
+
+    A thread on its tail leaves it straight, and must not lie across its arc.
+    """
+    poses = frames(*resting_poses(scene, item, 6 * rows, scene.objects[item].position[:2], LOOSE, rng))
+    good = (poses[:, :3, :3] @ axis_of(needle))[:, 2] < 0
+    tail = scene.objects[item].object.sites[TAIL][0]
+    inwards = poses[:, :3, :3] @ (centre_of(needle) - tail)
+    for system in scene.systems.values():
+        if any(tie.body == item for tie in system.ties):
+            first, second = np.array(system.path[:2])
+            good &= inwards @ (second - first) <= 0
+    return poses[good][:rows]
 
 
 def _flat(poses: np.ndarray) -> np.ndarray:
