@@ -33,10 +33,19 @@ from surgical_marl.physics.solver.contact_solver import ContactSolver
 from surgical_marl.physics.solver.problem import Contacts, Pressed, Problem, no_arms
 from surgical_marl.physics.state import ATTACHMENTS, Physics
 from surgical_marl.physics.systems.arms import ArmForces, Arms, accelerations_apart, implicit_change, relaxed
-from surgical_marl.physics.systems.coupling import Coupling
+from surgical_marl.physics.systems.coupling import Coupling, Sewing
 from surgical_marl.physics.systems.rigid_bodies import RigidBodies, RigidBodyState
 from surgical_marl.physics.systems.rigid_motion import Bodies
-from surgical_marl.physics.systems.system import Ends, Load, Response, Skin, SkinnedSystem, System
+from surgical_marl.physics.systems.system import (
+    Ends,
+    Followed,
+    Load,
+    Response,
+    Skin,
+    SkinnedSystem,
+    Strand,
+    System,
+)
 from surgical_marl.physics.tree_utils import empty_like
 from surgical_marl.scenes.scene import Scene
 
@@ -79,6 +88,20 @@ class Meeting(NamedTuple):
     """At the start of the step, if it follows needles; None for that after the last step."""
 
 
+class Following(NamedTuple):
+    """A system that follows needles, at the start of a step."""
+
+    state: Any
+    ends: Ends
+    needles: Followed
+    owners: list[str]
+    """Name of the system whose thread is behind each needle; empty where none is."""
+
+    def behind(self, thread: str) -> list[Sewing]:
+        """Return the needles to whose tails a thread is tied."""
+        return [Sewing(self.state, self.needles, n) for n, owner in enumerate(self.owners) if owner == thread]
+
+
 class Step:
     """The physics step of a scene with arms and, if it has any objects or other systems, rigid bodies."""
 
@@ -116,11 +139,8 @@ class Step:
             }
 
     def _skinned_of(self, system: System) -> dict[str, SkinnedSystem]:
-        """Return the systems whose skins one touches. A thread goes with its needle into tissue, so it touches none."""
-        tied = {tie.body for tie in system.ties}
-        if isinstance(system, SkinnedSystem):
-            return {}
-        return {name: one for name, one in self._skinned.items() if not tied & {*one.follows}}
+        """Return the systems whose skins one touches."""
+        return {} if isinstance(system, SkinnedSystem) else self._skinned
 
     def __call__(self, physics: Physics, touch: Touch, distance: Array | None = None) -> tuple[Physics, Touch]:
         """Return the state after one physics step, and the hardest touch up to the start of that step.
@@ -215,10 +235,14 @@ class Step:
         }  # fmt: skip
 
     def _meetings(self, physics: Physics, found: Found) -> dict[str, Meeting]:
-        """Return the contacts of all systems, and their answers. Systems with skins come last: others load them."""
+        """Return the contacts of all systems, and their answers.
+
+        Systems with skins follow needles first, as threads may be behind these, and answer last: others load them.
+        """
         meetings: dict[str, Meeting] = {}
+        following = {name: self._follow(name, physics, found) for name, one in self.systems.items() if one.follows}
         for name in sorted(self.systems, key=lambda name: name in self._skinned):
-            meetings[name] = self._meet(name, physics, found, meetings)
+            meetings[name] = self._meet(name, physics, found, meetings, following)
         moved = {name: one.displacements(meetings[name].response) for name, one in self._skinned.items()}
         for name, met in meetings.items():
             if touched := [moved[other] for other in self._couplings[name].skinned]:
@@ -226,22 +250,45 @@ class Step:
                 meetings[name] = met._replace(felt=felt)
         return meetings
 
-    def _meet(self, name: str, physics: Physics, found: Found, others: dict[str, Meeting]) -> Meeting:
+    def _expected(self, physics: Physics) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
+        """Return accelerations of joints [a, m] and bodies [k, 6] as in the last step, and velocities after this."""
+        bodies, by_arm, dt = physics.rigid_bodies.bodies, self._solver.twists.by_arm, self.arms.dt
+        expected = by_arm(physics.arms.qacc_warmstart), bodies.acceleration
+        return expected, (by_arm(physics.qvel) + dt * expected[0], bodies.velocity + dt * expected[1])
+
+    def _follow(self, name: str, physics: Physics, found: Found) -> Following:
+        """Return a system that follows needles, as these and their threads are at the start of the step."""
+        system, state, coupling, dt = self.systems[name], physics.systems[name], self._couplings[name], self.arms.dt
+        bodies, (_, motion) = physics.rigid_bodies.bodies, self._expected(physics)
+        scenery, skins = coupling.scenery(found.poses, found.joints, bodies, motion, dt), self._skins_of(name, physics)
+        ends = coupling.ends(system.shapes(state), skins, scenery, found.joints, bodies, motion, dt)
+        behind = [self._behind(body, physics) for body in system.follows]
+        needles = coupling.followed(bodies, motion[1])._replace(strands=tuple(strand for _, strand in behind))
+        return Following(*system.follow(state, ends, needles, dt), needles, [owner for owner, _ in behind])
+
+    def _behind(self, body: str, physics: Physics) -> tuple[str, Strand | None]:
+        """Return the thread at the tail of a body, and the name of its system."""
+        strands = [(name, one.strand(physics.systems[name], body)) for name, one in self.systems.items()]
+        return next(((name, strand) for name, strand in strands if strand), ("", None))
+
+    def _meet(
+        self, name: str, physics: Physics, found: Found, others: dict[str, Meeting], following: dict[str, Following]
+    ) -> Meeting:
         """Return the contacts of a system, and its answer to them and to the loads of others on its skin."""
         system, state, dt = self.systems[name], physics.systems[name], self.arms.dt
-        bodies, by_arm = physics.rigid_bodies.bodies, self._solver.twists.by_arm
-        expected = by_arm(physics.arms.qacc_warmstart), bodies.acceleration
-        motion = by_arm(physics.qvel) + dt * expected[0], bodies.velocity + dt * expected[1]
+        bodies, (expected, motion) = physics.rigid_bodies.bodies, self._expected(physics)
         shapes, coupling, awake = system.shapes(state), self._couplings[name], system.awake(state)
         scenery = coupling.scenery(found.poses, found.joints, bodies, motion, dt)
         skins, loads = self._skins_of(name, physics), self._loads(name, physics, others)
 
         def meet() -> tuple[Ends, Response, Any]:
-            now, ends = state, coupling.ends(shapes, skins, scenery, found.joints, bodies, motion, dt)
-            if system.follows:
-                now, ends = system.follow(state, ends, coupling.followed(bodies, motion[1]), dt)
+            if own := following.get(name):
+                now, ends = own.state, own.ends
+            else:
+                sewn = {other: one.behind(name) for other, one in following.items()}
+                now, ends = state, coupling.ends(shapes, skins, scenery, found.joints, bodies, motion, dt, sewn)
             response = system.respond(now, system.free_motion(now, dt), ends, dt, **loads)
-            return ends, response, now if system.follows else None
+            return ends, response, now if own else None
 
         if awake is True:
             ends, response, now = meet()

@@ -19,7 +19,9 @@ class ChannelFile:
     """Against a tip that advances in tissue."""
     friction: float = number(20.0, 0.0, 1e4, unit="N/m")
     """Along the needle, per length that is in tissue."""
+    thread_friction: float = number(20.0, 0.0, 1e4, unit="N/m")
+    """Along the thread behind it, likewise."""
     stiffness: float = number(1e5, 100.0, 1e7, unit="N/m2")
-    """Of the springs across the needle, and of friction before it slips, per length that is in tissue."""
+    """Of the springs across needle and thread, and of friction before it slips, per length that is in tissue."""
     spacing: float = number(1e-3, 1e-4, 0.01, unit="m")
-    """Distance of the points at which tissue holds a needle."""
+    """Distance of the points at which tissue holds needle and thread."""

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from surgical_marl.physics.contact.part_detection import _no_end
+from surgical_marl.physics.contact.part_detection import no_end
 from surgical_marl.physics.systems.channel_state import ChannelView
 from surgical_marl.physics.systems.needle import Needle
 from surgical_marl.physics.systems.system import Ends, Followed
@@ -98,7 +98,7 @@ def bodies_at(origins: Any, axes: Any = None, velocity: Any = None) -> Followed:
 
 def no_ends(tissue: Tissue) -> Ends:
     """Return no contacts, with room for those of the tissue."""
-    rows = jax.tree.map(jnp.zeros_like, room(jax.eval_shape(_no_end), tissue.contacts))
+    rows = jax.tree.map(jnp.zeros_like, room(jax.eval_shape(no_end), tissue.contacts))
     return Ends(rows, *[jnp.int32(0)] * 3)
 
 

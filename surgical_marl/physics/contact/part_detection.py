@@ -90,7 +90,7 @@ class PartDetection:
 
     def nothing(self, on: Spot | None = None) -> Ends:
         """Return an empty list of contacts, with one row more than there is room for: it takes what finds none."""
-        rows = room(jax.eval_shape(lambda: _no_end()._replace(on=on)), self._room + 1)
+        rows = room(jax.eval_shape(lambda: no_end()._replace(on=on)), self._room + 1)
         return Ends(rows, jnp.int32(0), jnp.int32(0), jnp.int32(0))
 
     def find(
@@ -240,7 +240,7 @@ class PartDetection:
         along = own.end - own.start
         share = jnp.clip((point.place - own.start) @ along / jnp.maximum(along @ along, 1e-12), 0.0, 1.0)
         stiffness, sliding = (jnp.asarray(x)[shape] for x in (self._stiffness, self._sliding))
-        end = _no_end()._replace(
+        end = no_end()._replace(
             part=part, share=share, shape=shape, depth=point.depth, place=point.place, normal=point.normal,
             stiffness=weight * stiffness, sliding=sliding,
         )  # fmt: skip
@@ -274,7 +274,7 @@ def on_face(part: Segments, plate: Plate) -> tuple[Points, Array]:
     return Points(depth, place, normal), jnp.maximum(over, RIM)
 
 
-def _no_end() -> End:
+def no_end() -> End:
     """Return a contact with nothing."""
     zero, number, vector = jnp.float32(0.0), jnp.int32(0), jnp.zeros(3)
     return End(number, zero, number, zero, vector, vector, zero, zero, jnp.bool_(False), vector, vector)

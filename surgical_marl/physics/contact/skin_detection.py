@@ -36,7 +36,8 @@ class Foot(NamedTuple):
 
 
 def add_skin_contacts(
-    ends: Ends, number: int, skin: Skin, faces: np.ndarray, shapes: Shapes, met: Surface, room: int, dt: Any
+    ends: Ends, number: int, skin: Skin, faces: np.ndarray, shapes: Shapes, met: Surface, room: int, dt: Any,
+    left_out: Array | None = None,
 ) -> Ends:  # fmt: skip
     """Return contacts with those of the parts of a system with the skin of another one.
 
@@ -49,6 +50,7 @@ def add_skin_contacts(
         met: stiffness and friction of the contact.
         room: for contacts.
         dt: duration of a step, s.
+        left_out: parts that do not touch it, [p] bool; None for none.
     """
     extent, balls = _extent(skin), _balls(skin, faces)
     radius = jnp.broadcast_to(jnp.asarray(shapes.radius), shapes.speed.shape)
@@ -66,13 +68,16 @@ def add_skin_contacts(
         )  # fmt: skip
 
     def of_part(found: Ends, row: Any) -> tuple[Ends, None]:
-        part, start, end, radius, speed = row
+        part, start, end, radius, speed, *out = row
         middle = (start + end) / 2
         inside, reach = _in_box(extent, middle, radius, speed, dt)
+        if out:
+            inside &= ~out[0]
         return when(inside, lambda found: meet(found, part, middle, radius, reach), found), None
 
     numbers = jnp.arange(len(shapes.speed), dtype=jnp.int32)
-    found: Ends = jax.lax.scan(of_part, ends, (numbers, shapes.start, shapes.end, radius, shapes.speed))[0]
+    rows = numbers, shapes.start, shapes.end, radius, shapes.speed, *([] if left_out is None else [left_out])
+    found: Ends = jax.lax.scan(of_part, ends, rows)[0]
     return found
 
 

@@ -91,7 +91,11 @@ def recall(memory: Stretches, ends: Ends, parts: int) -> Ends:
 
 def remember(ends: Ends, moved: Callable[[Array, End], Array], parts: int) -> Stretches:
     """Return the memory of contacts whose points move by `moved` relative to the shapes, as `each` calls it."""
-    key, stretch = each(ends, lambda row, end: (_key(end, parts), feel(end, moved(row, end)).stretch))
+    def note(row: Array, end: End) -> tuple[Array, Array]:
+        stretch = feel(end, moved(row, end)).stretch
+        return _key(end, parts), jnp.where(end.bilateral, 0.0, stretch)  # a tie has no friction to be remembered
+
+    key, stretch = each(ends, note)
     return Stretches(key, stretch, ends.total)
 
 

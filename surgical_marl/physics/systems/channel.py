@@ -21,11 +21,24 @@ from jax import Array
 
 from surgical_marl.physics.contact.spring_contact import Felt, feel
 from surgical_marl.physics.systems.brick_grid import BrickGrid
-from surgical_marl.physics.systems.channel_state import CUTS, FREE, POINTS, ChannelState, ChannelView, Tips, hold
+from surgical_marl.physics.systems.channel_state import (
+    CUTS,
+    FREE,
+    OFF,
+    POINTS,
+    ChannelState,
+    ChannelView,
+    Tips,
+    behind,
+    ends_of,
+    hold,
+    length_around,
+)
+from surgical_marl.physics.systems.channel_thread import Sewn
 from surgical_marl.physics.systems.material import Material
 from surgical_marl.physics.systems.needle import Arc, Needle
-from surgical_marl.physics.systems.puncture import Advance, Punctures, ends_of
-from surgical_marl.physics.systems.system import End, Ends, Followed, Spot
+from surgical_marl.physics.systems.puncture import Advance, Punctures
+from surgical_marl.physics.systems.system import End, Ends, Followed, Spot, Strand
 from surgical_marl.physics.tree_utils import put, room, row_of
 from surgical_marl.scenes.channel_file import ChannelFile
 
@@ -71,7 +84,7 @@ class Channels:
         number, flat, zero = jnp.full(c, -1, jnp.int32), jnp.zeros((n, 3)), jnp.zeros(n)
         tips = Tips(flat - 1, jnp.full(n, -1, jnp.int32), flat, jnp.zeros(n, jnp.int32), flat, zero)
         return ChannelState(jnp.zeros((c, POINTS, 3)), 0 * number, jnp.zeros((c, POINTS)), number,
-                            jnp.zeros(c, bool), jnp.zeros(c), tips)  # fmt: skip
+                            jnp.zeros(c, bool), jnp.zeros(c), number, jnp.full((c, POINTS), OFF), tips)  # fmt: skip
 
     # -- rows of contacts
 
@@ -121,8 +134,12 @@ class Channels:
             bodies: the needles.
             dt: duration of a step, s.
         """
-        each = [needle.at(bodies.origin[n], bodies.axes[n], bodies.size[n]) for n, needle in enumerate(self.needles)]
+        each = [self._arc(bodies, n) for n in range(len(self.needles))]
         arcs: Arc = jax.tree.map(lambda *parts: jnp.stack(parts), *each)
+        for n, strand in enumerate(bodies.strands):
+            if strand:
+                state = self.sewn(position, bodies, n, strand).followed(state)
+        bodies = bodies._replace(strands=())
         most = len(ends.rows.part)
         rows = room(jax.tree.map(lambda x: x[0], ends.rows), most + 1)
         start = Ends(rows, jnp.int32(0), jnp.int32(0), ends.left_out)
@@ -138,6 +155,13 @@ class Channels:
         rows, total = jax.tree.map(lambda x: x[:-1], found.rows), jnp.minimum(found.total, most)
         left_out = found.left_out + jnp.maximum(found.total - most, 0)
         return state, Ends(rows, jnp.minimum(found.moving, most), total, left_out)
+
+    def sewn(self, position: Array, bodies: Followed, n: int, strand: Strand) -> Sewn:
+        """Return a needle and its thread, in tissue whose nodes are there, m, [n, 3]."""
+        return Sewn(self.about, self.material, position, n, self._arc(bodies, n), strand)
+
+    def _arc(self, bodies: Followed, n: int) -> Arc:
+        return self.needles[n].at(bodies.origin[n], bodies.axes[n], bodies.size[n])
 
     def _of_needle(
         self, state: ChannelState, n: Array, arc: Arc, position: Array, ends: Ends, body: Followed, dt: Any
@@ -156,9 +180,9 @@ class Channels:
             def of_place(i: Array, found: tuple[Ends, Array, Array]) -> tuple[Ends, Array, Array]:
                 ends, length, way = found
                 place = self.material.place(position, state.places[c, i])
-                s = arc.nearest(place)
+                s = behind(self.material, state, c, i, arc, position)
                 foot, tangent = arc.point(s)
-                inside = self._inside(state, c, i, s, arc)
+                inside = length_around(self.material, state, c, i, s, 0.0, arc.length)
                 off = place - foot
                 bound = self.about.friction * inside
                 end = row(
@@ -192,18 +216,6 @@ class Channels:
         )  # fmt: skip
         end = jax.tree.map(lambda a, b: jnp.where(tips.does == CUTS, a, b), cuts, presses)
         return state, _after(ends, end, tips.does != FREE, True)
-
-    def _inside(self, state: ChannelState, c: Array, i: Array, s: Array, arc: Arc) -> Array:
-        """Return the length of a needle that a place of a channel holds, m: half the way to both neighbours.
-
-        The last place holds all of what goes on to a tip that cuts.
-        """
-        places, last, between = state.places[c], state.total[c] - 1, self.material.distance
-        back = jnp.where(i > 0, between(places[i], places[jnp.maximum(i - 1, 0)]), 0.0) / 2
-        onwards = between(places[i], places[jnp.minimum(i + 1, POINTS - 1)]) / 2
-        end = jnp.where(state.through[c], 0.0, jnp.maximum(s, 0.0))
-        ahead = jnp.where(i < last, onwards, end)
-        return jnp.maximum(jnp.minimum(arc.length, s + back) - jnp.maximum(0.0, s - ahead), 0.0)
 
     def _with_others(
         self, state: ChannelState, arcs: Arc, position: Array, found: Ends, ends: Ends, bodies: Followed
@@ -246,7 +258,9 @@ class Channels:
         entry, exit_, entry_at_rest, exit_at_rest, depth = jax.lax.map(one, (state.places, state.total))
         there = state.total > 0
         swept, through = jnp.where(there, state.swept, 0.0), state.through & there
-        return ChannelView(entry, exit_, entry_at_rest, exit_at_rest, depth, swept, there, through, state.needle)
+        return ChannelView(
+            entry, exit_, entry_at_rest, exit_at_rest, depth, swept, there, through, state.needle, state.thread
+        )
 
     def _at_rest(self, at: Array) -> Array:
         return at * self.material.cell

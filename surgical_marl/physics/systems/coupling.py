@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial, reduce
 from operator import add, or_
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -43,6 +43,17 @@ from surgical_marl.scenes.objects import JAW, LINK
 
 TIE = 2e4
 """Stiffness of a tie, N/m: a pull of 1 N stretches it by 50 um."""
+
+
+class Sewing(NamedTuple):
+    """A needle that a skinned system follows."""
+
+    state: Any
+    """Of that system, as the needles are now."""
+    bodies: Followed
+    """All that it follows."""
+    n: int
+    """Number of the needle among these."""
 
 
 class Coupling:
@@ -88,7 +99,7 @@ class Coupling:
 
     def ends(
         self, shapes: Shapes, skins: Sequence[Skin], scenery: Scenery, joints: Joints, bodies: Bodies,
-        motion: tuple[Array, Array], dt: Any,
+        motion: tuple[Array, Array], dt: Any, sewn: Mapping[str, Sequence[Sewing]] | None = None,
     ) -> Ends:  # fmt: skip
         """Return the contacts of a system.
 
@@ -101,12 +112,13 @@ class Coupling:
             motion: velocities of joints [a, m] and of bodies [k, 6] at the end of the step, if they accelerate as in
                 the last one.
             dt: duration of a step, s.
+            sewn: needles, by the names of skinned systems that follow them, to whose tails the system is tied.
         """
         ties = self._system.ties
         of_bodies, of_world = (
             [self._tied(tie, shapes, bodies) for tie in ties if (tie.body is None) == world] for world in (False, True)
         )
-        begun = self._on_skins(shapes, skins, dt) if skins else None
+        begun = self._on_skins(shapes, skins, dt, sewn or {}) if skins else None
         found = self._detection.find(scenery, shapes, of_bodies, of_world, dt, begun)
         by_skins = partial(_mean_of, [skin.velocity for skin in skins]) if skins else None
         shift = dt * self.accelerations(found, joints, bodies, *motion, by_skins)
@@ -114,12 +126,19 @@ class Coupling:
             shift = each(found, lambda row, end: _towards(end, shift[row]), moving=True)
         return found._replace(rows=found.rows._replace(shift=shift))
 
-    def _on_skins(self, shapes: Shapes, skins: Sequence[Skin], dt: Any) -> Ends:
-        """Return the contacts with skins, in the order of their numbers: the last one first."""
-        found, touched = self._detection.nothing(NOWHERE), [*enumerate(zip(skins, self.skinned.values(), strict=True))]
-        for number, (skin, other) in reversed(touched):
+    def _on_skins(
+        self, shapes: Shapes, skins: Sequence[Skin], dt: Any, sewn: Mapping[str, Sequence[Sewing]]
+    ) -> Ends:  # fmt: skip
+        """Return the contacts with skins, in the order of their numbers: the last one first. Those inside come then."""
+        found, touched = self._detection.nothing(NOWHERE), [*enumerate(zip(skins, self.skinned.items(), strict=True))]
+        for number, (skin, (name, other)) in reversed(touched):
             met, room = self._system.surface.against(other.surface), self._system.contacts
-            found = add_skin_contacts(found, number, skin, other.faces, shapes, met, room, dt)
+            inside = [other.inside(*needle) for needle in sewn.get(name, ())]
+            left_out = reduce(or_, inside) if inside else None
+            found = add_skin_contacts(found, number, skin, other.faces, shapes, met, room, dt, left_out)
+        for number, (_, (name, other)) in touched:
+            for needle in sewn.get(name, ()):
+                found = other.held(*needle, found, number)
         return found
 
     def visited(self, shapes: Shapes, skins: Sequence[Skin], scenery: Scenery, dt: Any) -> Array:
@@ -434,7 +453,7 @@ def _towards(end: End, shift: Array) -> Array:
 
     It would press on nothing, and come back in the next step: soft tissue has no momentum that would carry it away.
     """
-    away = jnp.where(end.shape < 0, jnp.minimum(end.normal @ shift, 0.0), 0.0)
+    away = jnp.where((end.shape < 0) & ~end.bilateral, jnp.minimum(end.normal @ shift, 0.0), 0.0)
     return shift - away * end.normal
 
 

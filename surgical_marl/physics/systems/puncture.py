@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from surgical_marl.physics.systems.channel_state import CUTS, FREE, POINTS, PRESSES, ChannelState, Tips
+from surgical_marl.physics.systems.channel_state import CUTS, FREE, OFF, POINTS, PRESSES, ChannelState, Tips, ends_of
 from surgical_marl.physics.systems.material import Material
 from surgical_marl.physics.systems.needle import Arc
 from surgical_marl.physics.tree_utils import put, row_of
@@ -98,10 +98,12 @@ class Advance:
             places = jnp.where(full, state.places[c][other], state.places[c])
             slip = jnp.where(full, state.slip[c][other], state.slip[c])
             count = jnp.where(full, POINTS // 2, state.total[c])
-            places, slip = put((places, slip), count, (place, jnp.float32(0.0)))
+            along = jnp.where(full, state.along[c][other], state.along[c])
+            places, slip, along = put((places, slip, along), count, (place, jnp.float32(0.0), jnp.float32(OFF)))
             through = state.through[c] | comes_out
-            own = put((state.places, state.slip, state.total, state.through), c, (places, slip, count + 1, through))
-            return state._replace(**dict(zip(("places", "slip", "total", "through"), own, strict=True)))
+            names, rows = ("places", "slip", "along", "total", "through"), (places, slip, along, count + 1, through)
+            own = put(tuple(getattr(state, name) for name in names), c, rows)
+            return state._replace(**dict(zip(names, own, strict=True)))
 
         grows = comes_out | (inside & (front >= self._about.spacing))
         return jax.lax.cond(grows, longer, lambda state: state, state)
@@ -141,7 +143,7 @@ class Advance:
         def look(c: Array, found: tuple[Array, ...]) -> tuple[Array, ...]:
             again, empty, spare = found
             first, second = (self._material.place(self._position, state.places[c, i]) for i in (0, 1))
-            idle, way = state.needle[c] < 0, first - tip
+            idle, way = (state.needle[c] < 0) & (state.thread[c] < 0), first - tip
             near = (way @ way < reach * reach) & ((second - first) @ self._arc.along > 0) & (state.total[c] > 1)
             return (
                 jnp.where(idle & near, c, again),
@@ -161,7 +163,9 @@ class Advance:
             own = (jnp.int32(self._n), count, through, swept)
             needle, count, through, swept = put((state.needle, state.total, state.through, state.swept), c, own)
             places = state.places.at[c, 0].set(entry, mode="promise_in_bounds")
-            return state._replace(needle=needle, total=count, through=through, swept=swept, places=places)
+            along = state.along.at[c].set(OFF, mode="promise_in_bounds")
+            return state._replace(needle=needle, total=count, through=through, swept=swept, places=places,
+                                  along=along)  # fmt: skip
 
         enters = opens | (again >= 0)
         state = jax.lax.cond(enters, first, lambda state: state, state)
@@ -175,10 +179,3 @@ def _crossed(before: Array, after: Array) -> Array:
     plane = jnp.where(way > 0, jnp.floor(before) + 1, jnp.floor(before))
     share = jnp.where(jnp.abs(way) > 1e-9, (plane - before) / jnp.where(jnp.abs(way) > 1e-9, way, 1.0), 1.0)
     return before + jnp.clip(jnp.min(share), 0.0, 1.0) * way
-
-
-def ends_of(material: Material, state: ChannelState, c: Array, arc: Arc, position: Array) -> tuple[Array, Array]:
-    """Return how far behind a tip the first and the last place of a channel are along a centre line, m."""
-    last = jnp.maximum(state.total[c] - 1, 0)
-    first, last = (material.place(position, state.places[c, i]) for i in (0, last))
-    return arc.nearest(first), arc.nearest(last)

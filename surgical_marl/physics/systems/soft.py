@@ -48,4 +48,5 @@ class Soft(System):
         if not self.ranges.friction:
             return ends
         sliding = jnp.sqrt(self.factors.friction) * ends.rows.sliding
+        sliding = jnp.where(ends.rows.bilateral, ends.rows.sliding, sliding)  # in a channel friction is a force
         return ends._replace(rows=ends.rows._replace(sliding=sliding))

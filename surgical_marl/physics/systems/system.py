@@ -17,6 +17,7 @@ from functools import reduce
 from operator import add, or_
 from typing import Any, ClassVar, NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
@@ -97,7 +98,7 @@ class End(NamedTuple):
     sliding: Array
     """Coefficient of friction."""
     bilateral: Array
-    """True of a tie, which pulls too and does not slip."""
+    """True of a tie, which pulls too and does not slip; with a skin: of a thread that is held inside of the system."""
     shift: Array
     """Displacement of the shape in the step if it accelerates as in the last one, m, [..., 3]."""
     stretch: Array
@@ -119,6 +120,45 @@ class Ends(NamedTuple):
     """Number of contacts that found no room, []."""
 
 
+class Strand(NamedTuple):
+    """A thread of p parts of one length, from the end on that is tied to the tail of a needle. World."""
+
+    position: Array
+    """Of its nodes, m, [p + 1, 3]."""
+    holds: Any
+    """1 for parts that hold, 0 for torn ones, [p]."""
+    part: float
+    """Length of a part at rest, m."""
+    backwards: bool
+    """True if its system numbers the parts from the other end."""
+
+    @property
+    def length(self) -> float:
+        """At rest, m."""
+        return self.part * len(self.holds)
+
+    def at(self, along: Array) -> tuple[Array, Array]:
+        """Return the part, counted from the needle, and the share of it at a length from the needle, m."""
+        part = jnp.clip(jnp.floor(along / self.part).astype(jnp.int32), 0, len(self.holds) - 1)
+        return part, along / self.part - part
+
+    def point(self, along: Array) -> tuple[Array, Array]:
+        """Return the point [3] at a length from the needle, m, and the unit tangent [3] there, towards the needle.
+
+        Beyond its ends the thread goes on straight. Tangents turn evenly along a part, from node to node.
+        """
+        part, share = self.at(along)
+        place = (1 - share) * self.position[part] + share * self.position[part + 1]
+        share = jnp.clip(share, 0.0, 1.0)
+        way = (1 - share) * self._tangent(part) + share * self._tangent(part + 1)
+        return place, way / jnp.sqrt(jnp.maximum(way @ way, 1e-12))
+
+    def _tangent(self, node: Array) -> Array:
+        last = len(self.holds)
+        way = self.position[jnp.maximum(node - 1, 0)] - self.position[jnp.minimum(node + 1, last)]
+        return way / jnp.sqrt(jnp.maximum(way @ way, 1e-18))
+
+
 class Followed(NamedTuple):
     """The free bodies that a system follows, n of them. World."""
 
@@ -136,6 +176,8 @@ class Followed(NamedTuple):
     """Number of the first shape of each, [n]."""
     shapes: Any
     """Number of shapes of each, [n]."""
+    strands: tuple[Strand | None, ...] = ()
+    """The thread at the tail of each; nothing where none has any."""
 
 
 class Response(NamedTuple):
@@ -253,6 +295,11 @@ class System(ABC):
     def apply(self, state: Any, response: Response, ends: Ends, accelerations: Array, dt: Any) -> Any:
         """Return the state after a step in which the ends accelerate by so much beyond `shift`, m/s2, [c, 3]."""
 
+    def strand(self, state: Any, body: str) -> Strand | None:
+        """Return the thread that it has at the tail of a free body; None if it has none."""
+        del state, body
+        return None
+
     def awake(self, state: Any) -> Any:
         """Return whether it moves, [] bool; True if it never sleeps.
 
@@ -286,6 +333,28 @@ class SkinnedSystem(System):
     @abstractmethod
     def skin(self, state: Any) -> Skin:
         """Return the nodes."""
+
+    def inside(self, state: Any, bodies: Followed, n: int) -> Array:
+        """Return which parts of the thread behind a body that it follows do not touch its skin, [p] bool.
+
+        They are in it, or at the place where the thread goes in or out.
+        """
+        strand = bodies.strands[n]
+        assert strand
+        return jnp.zeros(len(strand.holds), bool)
+
+    def held(self, state: Any, bodies: Followed, n: int, ends: Ends, number: int) -> Ends:
+        """Return the contacts of the thread behind a body with those inside of this system, the last of its skins.
+
+        Args:
+            state: of this system.
+            bodies: that it follows.
+            n: number of the body.
+            ends: other contacts of the thread with skins, in arrays with one row more than there is room for.
+            number: of this skin.
+        """
+        del state, bodies, n, number
+        return ends
 
     @abstractmethod
     def respond(self, state: Any, motion: Any, ends: Ends, dt: Any, load: Load | None = None) -> Response:

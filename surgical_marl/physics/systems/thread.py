@@ -18,7 +18,7 @@ import numpy as np
 from jax import Array
 
 from surgical_marl.content import unknown
-from surgical_marl.physics.contact.spring_contact import Stretches, each, feel, none, pushes, recall, remember
+from surgical_marl.physics.contact.spring_contact import Felt, Stretches, each, feel, none, pushes, recall, remember
 from surgical_marl.physics.solver.cholesky import FULL, LOWER
 from surgical_marl.physics.systems import crossings
 from surgical_marl.physics.systems.chain import (
@@ -33,9 +33,10 @@ from surgical_marl.physics.systems.chain import (
     search,
     solve,
 )
+from surgical_marl.physics.systems.channel_state import hold
 from surgical_marl.physics.systems.crossings import Joined
 from surgical_marl.physics.systems.soft import Soft
-from surgical_marl.physics.systems.system import Bars, End, Ends, Response, Shapes, Tie
+from surgical_marl.physics.systems.system import Bars, End, Ends, Response, Shapes, Strand, Tie
 from surgical_marl.physics.tree_utils import row_of
 from surgical_marl.scenes.objects import Placement, Surface
 from surgical_marl.scenes.thread_file import ThreadFile
@@ -43,8 +44,9 @@ from surgical_marl.untrusted.schema import Place
 
 ITERATIONS = 4
 """Newton steps of a physics step."""
-SPARE = 24
-"""Room for contacts beyond one for each edge: a thread may lie on a board, and be held by jaws too."""
+SPARE, SEWN = 24, 32
+"""Room for contacts beyond one for each edge: a thread may lie on a board, and be held by jaws too, and one behind a
+needle may be in tissue, which holds an edge at several places."""
 TAIL = "tail"
 """The site of a needle that a thread is fastened to."""
 
@@ -161,7 +163,8 @@ class Thread(Soft):
 
     @property
     def contacts(self) -> int:
-        return self.nodes - 1 + SPARE + len(self.ties)
+        sewn = SEWN if any(tie.body for tie in self.ties) else 0
+        return self.nodes - 1 + SPARE + sewn + len(self.ties)
 
     def start(self, places: Array) -> ThreadState:
         """Return the thread at rest. It begins where its first tie is."""
@@ -214,7 +217,7 @@ class Thread(Soft):
 
         def at_end(row: Array, end: End) -> tuple[Array, Array]:
             del row
-            felt = feel(end, _point(end, found.shift) - end.shift)
+            felt = _feel(end, _point(end, found.shift) - end.shift)
             force = felt.force - felt.stiffness @ _point(end, found.change[:, :3])
             return -force, felt.stiffness[LOWER]
 
@@ -249,6 +252,14 @@ class Thread(Soft):
         pairs = response.solved.pairs
         rubbed = remember(pairs, lambda row, end: crossings.apart(end, u), self.nodes - 1)
         return ThreadState(chain, stretches, rubbed, holds, (ends.moving == 0) & (most < ENOUGH))
+
+    def strand(self, state: ThreadState, body: str) -> Strand | None:
+        for tie in self.ties:
+            if tie.body == body:
+                backwards, holds = tie.part > 0, self._holds(state)[:-1]
+                order = slice(None, None, -1) if backwards else slice(None)
+                return Strand(state.chain.position[order], holds[order], self.rod.length, backwards)
+        return None
 
     def awake(self, state: ThreadState) -> Array:
         return ~state.still
@@ -289,6 +300,16 @@ def _tie(
     return Tie(part, share, name, tuple(others[name].object.sites[TAIL][0].tolist()))
 
 
+def _feel(end: End, moved: Array) -> Felt:
+    """Return the force of a contact with a shape, or with a place inside of tissue, whose point moves by this much."""
+    felt = feel(end, moved)
+    if end.on is None:
+        return felt
+    held = end.bilateral & (end.shape < 0)
+    found: Felt = jax.tree.map(lambda a, b: jnp.where(held, a, b), hold(end, moved), felt)
+    return found
+
+
 def _point(end: End, u: Array) -> Array:
     """Return the displacement [3] of the point of a contact by those of the nodes, [n, 3]."""
     return (1 - end.share) * u[end.part] + end.share * u[end.part + 1]
@@ -305,7 +326,7 @@ def _load(ends: Ends, u: Array) -> Loaded:
 
     def add(row: Array, sums: Loaded) -> Loaded:
         end = row_of(ends.rows, row)
-        felt = feel(end, _point(end, u) - end.shift)
+        felt = _feel(end, _point(end, u) - end.shift)
         first, second, falls = 1 - end.share, end.share, felt.stiffness[LOWER]
         return Loaded(
             _spread(sums.force, end.part, first * felt.force, second * felt.force),

@@ -24,6 +24,7 @@ from surgical_marl.physics.systems.brick_grid import BrickGrid, SurfacePoints
 from surgical_marl.physics.systems.brick_solve import BrickSolver, Nodes, Support
 from surgical_marl.physics.systems.channel import Channels
 from surgical_marl.physics.systems.channel_state import ChannelState, ChannelView
+from surgical_marl.physics.systems.channel_thread import Sewn
 from surgical_marl.physics.systems.needle import Needle
 from surgical_marl.physics.systems.soft import Soft
 from surgical_marl.physics.systems.system import (
@@ -216,6 +217,21 @@ class Tissue(Soft, SkinnedSystem):
         others = self.rubbed(ends)  # friction in channels is not that of surfaces
         channels, ends = self.channels.follow(state.channels, state.nodes.position, others, bodies, dt)
         return state._replace(channels=channels), ends
+
+    def inside(self, state: TissueState, bodies: Followed, n: int) -> Array:
+        return self._sewn(state, bodies, n).inside(self._channels_of(state))
+
+    def held(self, state: TissueState, bodies: Followed, n: int, ends: Ends, number: int) -> Ends:
+        return self._sewn(state, bodies, n).with_holds(self._channels_of(state), ends, number)
+
+    def _sewn(self, state: TissueState, bodies: Followed, n: int) -> Sewn:
+        strand = bodies.strands[n]
+        assert self.channels and strand, "tissue without channels follows no needle"
+        return self.channels.sewn(state.nodes.position, bodies, n, strand)
+
+    def _channels_of(self, state: TissueState) -> ChannelState:
+        assert state.channels, "tissue without channels follows no needle"
+        return state.channels
 
     def shapes(self, state: TissueState) -> Shapes:
         """Return a ball at each surface point, under the surface."""
