@@ -91,6 +91,7 @@ def recall(memory: Stretches, ends: Ends, parts: int) -> Ends:
 
 def remember(ends: Ends, moved: Callable[[Array, End], Array], parts: int) -> Stretches:
     """Return the memory of contacts whose points move by `moved` relative to the shapes, as `each` calls it."""
+
     def note(row: Array, end: End) -> tuple[Array, Array]:
         stretch = feel(end, moved(row, end)).stretch
         return _key(end, parts), jnp.where(end.bilateral, 0.0, stretch)  # a tie has no friction to be remembered
