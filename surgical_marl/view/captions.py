@@ -27,6 +27,8 @@ GROUND = (24, 28, 33)
 """Colour of a panel."""
 _LINES = 32
 """Lines that are as high as a picture."""
+_SPACING = 1.3
+"""Height of a line, in sizes of letters."""
 _SMALLEST = 10
 """Size of letters at least, pixels."""
 _FAULTS = ("collision", "drop")
@@ -65,9 +67,8 @@ class Captions:
         for name in env.task.stages:
             done = name in reached
             found.append(Caption(f"{'+' if done else '-'} {name.replace('_', ' ')}", WHITE if done else GREY))
-        if all(_true(own, "success", index) for own in infos.values()):
-            found.append(Caption("success", GREEN))
-        return found
+        worked = all(_true(own, "success", index) for own in infos.values())
+        return [*found, Caption("success" if worked else "", GREEN)]  # always a line, so that letters keep their size
 
     def forget(self, ended: NDArray[np.bool_]) -> None:
         """Begin anew where episodes have ended, [N] bool."""
@@ -82,9 +83,13 @@ def colour_of(agent: int) -> Rgb:
 
 
 def panel(captions: Sequence[Caption], width: int, height: int, whole: int) -> Picture:
-    """Return captions on a dark ground, [height, width, 3]; letters fit a picture of a height of `whole` pixels."""
+    """Return captions on a dark ground, [height, width, 3]; letters fit a picture of a height of `whole` pixels.
+
+    They are smaller where there are so many lines that some would be cut off.
+    """
     image = Image.new("RGB", (width, height), GROUND)
-    _write(ImageDraw.Draw(image), captions, width, max(_SMALLEST, whole // _LINES))
+    size = min(max(_SMALLEST, whole // _LINES), int(height / (_SPACING * len(captions) + 1 / 3)) if captions else whole)
+    _write(ImageDraw.Draw(image), captions, width, max(size, 1))
     return np.asarray(image)
 
 
@@ -109,7 +114,7 @@ def _write(
         for line in wrapped(text, font, width - 2 * left):
             if shown:
                 draw.text((left, top), line, font=font, fill=colour)
-            right, top = max(right, left + round(font.getlength(line))), top + round(1.35 * size)
+            right, top = max(right, left + round(font.getlength(line))), top + round(_SPACING * size)
     return right, top
 
 

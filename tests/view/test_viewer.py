@@ -216,6 +216,17 @@ def test_a_take_leads_to_the_same_numbers(tmp_path: Path) -> None:
     assert found.differs_at == 33 and found.largest > 0
 
 
+@pytest.mark.slow
+def test_a_take_of_a_needle_in_tissue_leads_to_the_same_numbers(tmp_path: Path) -> None:
+    session = Session(Settings(task="needle_drive", scene="psm_suture", seed=1), "oracle", record=tmp_path)
+    for _ in range(150):
+        session.step()
+    session.close()
+    assert replay(tmp_path / "take-0001.npz").differs_at is None
+    entered = [float(info["stage_entered"][0]) for info in session.infos.values()]
+    assert entered == [1.0]
+
+
 def test_a_take_keeps_a_scene_of_the_users_own(tmp_path: Path) -> None:
     """The program is that of the test above: the scene has the name and the content of one that ships."""
     own, takes = tmp_path / "bimanual_psm.yaml", tmp_path / "takes"
