@@ -82,7 +82,7 @@ def test_cuda_code_computes_what_jax_does(sheet: str, contacts: int, q: int, dev
     (step, respond, move), nodes, (held, ends) = step_of(sheet), shaken(tissue, 4e-4), touched(tissue, contacts, q)
     expected = respond(nodes, held, ends)
     assert contacts == 0 or (np.abs(expected.force[:contacts]).max(1) > 0).sum() >= 4
-    close(run_block(device, step.respond, nodes, held, ends), expected, contacts, 2e-5)
+    close(run_block(device, step.respond, nodes, held, ends), expected, contacts, 5e-5)
     pushed = jnp.asarray(
         np.random.default_rng(2).normal(size=(ROOM, 3)) * (np.arange(ROOM) < contacts)[:, None], jnp.float32
     )

@@ -128,7 +128,7 @@ class BrickSolver:
             block = inertia * jnp.array([1.0, 0.0, 1.0, 0.0, 0.0, 1.0])
             return mass * (v / dt + self.gravity) - support * (x - rest), block, inertia, free * dt * v
 
-        def add(sums: tuple[Array, ...], first: Array) -> tuple[tuple[Array, ...], Cell]:
+        def add(sums: tuple[Array, Array, Array], first: Array) -> tuple[tuple[Array, Array, Array], Cell]:
             nodes, upper = first + jnp.asarray(grid.offsets), first + jnp.asarray(grid.offsets[1::2])
             cell, forces = self.brick.deformed(state.position[nodes])
             own, pair = (blend * (cell.turn @ k @ cell.turn.T) for k in (self.brick.diagonal, self.brick.upright))
