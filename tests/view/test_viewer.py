@@ -219,12 +219,12 @@ def test_a_take_leads_to_the_same_numbers(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_a_take_of_a_needle_in_tissue_leads_to_the_same_numbers(tmp_path: Path) -> None:
     session = Session(Settings(task="needle_drive", scene="psm_suture", seed=1), "oracle", record=tmp_path)
+    entered = False
     for _ in range(150):
         session.step()
+        entered |= bool(session.infos["psm_0"]["stage_entered"][0])
     session.close()
-    assert replay(tmp_path / "take-0001.npz").differs_at is None
-    entered = [float(info["stage_entered"][0]) for info in session.infos.values()]
-    assert entered == [1.0]
+    assert entered and replay(tmp_path / "take-0001.npz").differs_at is None
 
 
 def test_a_take_keeps_a_scene_of_the_users_own(tmp_path: Path) -> None:
