@@ -163,6 +163,28 @@ def test_a_needle_that_goes_back_takes_its_thread_out(threaded: Hands) -> None:
     assert state.needle[0] == -1 and state.thread[0] == -1 and (np.asarray(state.along) == -1).all()
 
 
+def test_a_stitch_holds_both_edges_together(bench: Bench, stitched: Hands) -> None:
+    """Against 1 N on each edge, around its bite. The ends are pulled over the other edges, as those of a knot are."""
+    hands, rest = stitched.copy(), bench.tissue.rest
+    reach = (LENGTH - 2 * THICK - (RIGHT - LEFT)[1]) / 2 + 0.008
+    pin = [RIGHT[0] + 0.002, RIGHT[1] + PIN_LENGTH - reach, 0.007]
+    weight = [LEFT[0] - 0.002, LEFT[1] + reach, 0.007]
+    hands.lead(300, pin=pin, weight=weight, turn=90.0)
+    sides = [(np.abs(rest[:, :2] - bite) < [0.0052, 0.0021]).all(1) for bite in (LEFT, RIGHT)]
+    pull = np.zeros_like(rest)
+    for way, side in zip((-1, 1), sides, strict=True):
+        pull[side, 1] = way / side.sum()
+
+    def wider(seen: Seen) -> float:
+        moved = seen.nodes[-1, :, 1] - rest[:, 1]
+        return float(moved[sides[1]].mean() - moved[sides[0]].mean())
+
+    held, free = hands.lead(100, pull=pull), Hands(bench).lead(100, pull=pull)
+    assert wider(free) > 0.001
+    assert wider(held) < 0.0003
+    assert channels(hands).thread.tolist() == [0, 0, -1, -1] and held.left_out.max() == 0
+
+
 def test_a_thread_runs_through_four_channels(stitched: Hands) -> None:
     """A running suture: down and up through both edges, twice. All of them hold it, by friction in each."""
     hands, aside = stitched.copy(), np.array([0.006, 0.0])
