@@ -32,7 +32,7 @@ def play(rod: Rod, place: np.ndarray, steps: int, dt: float, held: Any = (), pul
     holds = np.append(np.ones(n - 1), 0.0).astype(np.float32)
 
     def step(state: ChainState, _: None) -> tuple[ChainState, Any]:
-        def load(u: Array) -> Loaded:
+        def load(u: Array, _: Array) -> Loaded:
             return Loaded(-stiff * (u + (state.position - at)) + pull, own, jnp.zeros((n, 6)))
 
         found = search(rod, state, free_forces(rod, state, dt), load, dt, 4, holds)
@@ -141,7 +141,7 @@ def test_the_factors_solve_the_step_s_own_matrix() -> None:
     own = shapes @ np.swapaxes(shapes, 1, 2)
     falls = jnp.asarray(own[:, np.tril_indices(3)[0], np.tril_indices(3)[1]], jnp.float32)
 
-    def load(u: Array) -> Loaded:
+    def load(u: Array, _: Array) -> Loaded:
         return Loaded(-jnp.einsum("nij,nj->ni", jnp.asarray(own, jnp.float32), u), falls, jnp.zeros((n, 6)))
 
     def steady(pull: Array) -> Any:

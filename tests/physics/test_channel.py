@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -89,6 +91,17 @@ def test_a_channel_is_where_the_needle_went(pierced: tuple[TissueState, Seen]) -
     np.testing.assert_allclose(view.entry_at_rest[-1, 0], [*PLACE[:2], SIZE[2]], atol=3e-4)
     np.testing.assert_allclose(view.exit_at_rest[-1, 0], [*PLACE[:2], 0], atol=5e-4)
     assert view.depth[-1, 0] == pytest.approx(SIZE[2]) and view.swept[-1, 0] < 2e-4
+
+
+def test_infos_have_the_largest_of_each_number_of_channels(sewn: tuple[TissueState, Seen]) -> None:
+    view = TISSUE.view(sewn[0])
+    depth, count = float(np.max(view.channels.depth)), int(np.sum(view.channels.there))
+    assert depth > 1e-3 and count == 1
+    told = {name: float(getattr(view, name)) for name in TISSUE.reports}
+    assert told["bite_depth"] == depth and told["channel_count"] == count
+    assert told["swept"] == np.max(view.channels.swept)
+    assert told["tip_force"] == np.max(sewn[0].channels.tips.pressed)
+    assert replace(TISSUE, needles=()).reports == ("tissue_force",)
 
 
 def length(state: TissueState, channel: int = 0) -> float:

@@ -98,12 +98,26 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:
 
 
 def test_tissue_bears_the_weight_of_a_thread(scene: Scene) -> None:
-    _, seen = scene.run(scene.home, 160)
+    after, seen = scene.run(scene.home, 160)
     late = scene.on_thread(seen, [0.0, 0.0, 0.0])[80:]
     np.testing.assert_allclose(late.mean(0) / scene.weight, [0.0, 0.0, 1.0], atol=1e-3)
     np.testing.assert_allclose(-np.asarray(seen.load)[80:].mean(0) / scene.weight, [0.0, 0.0, 1.0], atol=1e-3)
     assert np.abs(np.asarray(seen.velocity)[-1]).max() < 1e-4
     assert np.ptp(np.asarray(seen.place)[-1, :, 2]) < 2e-4  # it follows the tissue, which sags a little
+    np.testing.assert_allclose(after.systems["thread"].side[:, 2], 1.0, atol=1e-3)
+    pressed = scene.thrown(after, [0.0, 0.0, 0.0], lifted=-3.5e-3)  # the lower face is nearer now
+    assert np.asarray(scene.run(pressed, 160)[1].place)[:, :, 2].min() > 4e-3
+
+
+@pytest.mark.parametrize("way", [0, 1])
+def test_a_thread_that_slides_on_tissue_stops_as_coulomb_says(scene: Scene, way: int) -> None:
+    """Along itself and across, on faces that sag between the nodes. Each step goes on with the speed at its end."""
+    speed, begun = 0.2, [0.2 * (k == way) for k in range(3)]
+    rest, _ = scene.run(scene.home, 160)
+    _, seen = scene.run(scene.thrown(rest, begun), 160)
+    start, place = np.asarray(rest.systems["thread"].chain.position), np.asarray(seen.place)
+    moved = scene.mass @ (place[-1] - start)[:, way] / scene.mass.sum()
+    np.testing.assert_allclose(moved, speed * (speed - MU * 9.81 * DT) / (2 * MU * 9.81), rtol=0.02)
 
 
 def test_forces_on_both_sum_to_zero_and_energy_does_not_grow(scene: Scene) -> None:
@@ -158,5 +172,19 @@ def test_the_nearest_point_of_a_skin_is_found(point: list[float], distance: floa
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 3] - corners[:, 0])
     assert (np.einsum("fi,fi->f", normal, corners.mean(1) - grid.rest.mean(0)) > 0).all()
     skin = Skin(jnp.asarray(grid.rest), jnp.zeros_like(jnp.asarray(grid.rest)))
-    foot = nearest(skin, faces, _balls(skin, faces), jnp.array(point))
+    foot = nearest(skin, faces, _balls(skin, faces), jnp.array(point), jnp.zeros(3))
+    np.testing.assert_allclose(np.sqrt(foot.square), distance, atol=1e-7)
+
+
+@pytest.mark.parametrize(
+    ("point", "side", "distance"),
+    [(0.0012, [0.0, 0.0, 1.0], 0.0038), (0.0012, [0.0, 0.3, -1.0], 0.0012), (0.0052, [0.0, 0.0, -1.0], 0.0002)],
+)
+def test_what_has_come_through_a_face_belongs_on_its_other_side(
+    point: float, side: list[float], distance: float
+) -> None:  # fmt: skip
+    """At a height in tissue that is 5 mm thick, and over it: there no face below has been passed."""
+    grid = BrickGrid(SHEET["size"], np.ones(SHEET["cells"], bool), 1000.0)
+    skin, faces = Skin(jnp.asarray(grid.rest), jnp.zeros_like(jnp.asarray(grid.rest))), grid.faces()
+    foot = nearest(skin, faces, _balls(skin, faces), jnp.array([0.014, 0.008, point]), jnp.array(side))
     np.testing.assert_allclose(np.sqrt(foot.square), distance, atol=1e-7)

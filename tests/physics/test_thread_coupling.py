@@ -13,6 +13,8 @@ import yaml
 import surgical_marl as sm
 from surgical_marl.envs.batch import BatchedEnv
 from surgical_marl.physics.simulator import Simulator
+from surgical_marl.physics.systems.coupling import TIE
+from surgical_marl.scenes.objects import JAW
 
 THREAD = {
     "kind": "thread", "length": 0.05, "diameter": 0.00022, "material": "nylon", "nodes": 20, "drag": 0.0,
@@ -26,6 +28,32 @@ def scene_file(folder: Path, arm: str, objects: dict[str, Any]) -> str:
     arms = {f"{arm}_0": {"arm": arm, "position": [0.0, 0.0, 0.15], "workspace": [0.0, 0.0, -0.11]}}
     path.write_text(yaml.safe_dump({"arms": arms, "objects": objects}))
     return str(path)
+
+
+def growth(masses: tuple[float, float], stiffness: float, dt: float = 2.5e-3) -> float:
+    """Return by what factor two masses on a spring move more in each step, if each knows the other's last acceleration.
+
+    Place and velocity of both, and the accelerations of the last step, are the unknowns.
+    """
+
+    def step(state: np.ndarray) -> np.ndarray:
+        x, v, a = state.reshape(3, 2)
+        ahead = x + dt * v + dt * dt * a
+        force = stiffness * (ahead[1] - ahead[0]) * np.array([1.0, -1.0])
+        a = (force + stiffness * dt * dt * a) / (np.array(masses) + stiffness * dt * dt)
+        v = v + dt * a
+        return np.concatenate([x + dt * v, v, a])
+
+    return float(np.abs(np.linalg.eigvals(np.array([step(row) for row in np.eye(6)]).T)).max())
+
+
+def test_no_thread_is_stiff_enough_to_make_two_owners_unstable() -> None:
+    """A PSM's jaw is no lighter than 0.71 kg in any direction, and takes hold of five edges with both pads."""
+    jaw, needle = 0.71, 7e-5
+    grip = 10 * JAW.against(sm.load_scene("bimanual_psm_thread_alone").systems["thread"].surface).stiffness
+    assert growth((jaw, needle), 1 / (1 / TIE + 1 / grip)) < 1 + 1e-6
+    assert growth((jaw, jaw), grip / 2) < 1 + 1e-6
+    assert growth((jaw, needle), 1.5 * TIE) > 1.01
 
 
 @pytest.mark.slow

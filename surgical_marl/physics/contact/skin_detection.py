@@ -2,6 +2,9 @@
 
 A face between four nodes is a bilinear surface, so neighbours meet without a gap. A part touches a skin at one point at
 most. So what slides from face to face keeps its friction, and no seam between faces is felt.
+
+A part stays on the side of a skin that it came from, also where tissue is crushed so thin that its other side is
+nearer.
 """
 
 from __future__ import annotations
@@ -15,7 +18,7 @@ from jax import Array
 
 from surgical_marl.physics.contact.part_detection import AHEAD, NEAR
 from surgical_marl.physics.systems.system import End, Ends, Shapes, Skin, Spot
-from surgical_marl.physics.tree_utils import put, when
+from surgical_marl.physics.tree_utils import put, row_of, when
 from surgical_marl.scenes.objects import Surface
 
 DEEPEST = 0.004
@@ -54,9 +57,10 @@ def add_skin_contacts(
     """
     extent, balls = _extent(skin), _balls(skin, faces)
     radius = jnp.broadcast_to(jnp.asarray(shapes.radius), shapes.speed.shape)
+    known = jnp.zeros_like(shapes.start) if shapes.side is None else shapes.side
 
     def meet(found: Ends, part: Array, middle: Array, radius: Array, reach: Array) -> Ends:
-        foot = nearest(skin, faces, balls, middle)
+        foot = nearest(skin, faces, balls, middle, known[part])
         end = _end(skin, jnp.asarray(faces)[foot.face], foot, part, middle, radius)
         end = end._replace(shape=jnp.int32(-1 - number), stiffness=jnp.float32(met.stiffness),
                            sliding=jnp.float32(met.sliding))  # fmt: skip
@@ -94,27 +98,51 @@ def near_skin(skin: Skin, shapes: Shapes, dt: Any) -> Array:
     return found
 
 
-def nearest(skin: Skin, faces: np.ndarray, balls: Array, point: Array) -> Foot:
-    """Return the nearest point of a skin to a point [3]. Faces beyond `DEEPEST` are not looked at."""
+def sides(ends: Ends, parts: int) -> Array:
+    """Return the direction from a skin to each of the parts that are near one, [p, 3]; 0 for all others."""
 
-    def look(best: Foot, row: Any) -> tuple[Foot, None]:
+    def note(row: Array, found: Array) -> Array:
+        end = row_of(ends.rows, row)
+        side = jnp.where((end.shape < 0) & ~end.bilateral, end.normal, found[end.part])
+        return found.at[end.part].set(side, mode="promise_in_bounds")
+
+    found: Array = jax.lax.fori_loop(0, ends.moving, note, jnp.zeros((parts, 3)))
+    return found
+
+
+def nearest(skin: Skin, faces: np.ndarray, balls: Array, point: Array, side: Any) -> Foot:
+    """Return the nearest point of a skin to a point [3], on faces that are not beyond `DEEPEST`.
+
+    If the point has come through the face on its own side, it is the nearest point on faces of that side. `side` is a
+    direction from the skin, [3]; 0 if none is known.
+    """
+
+    def look(best: tuple[Foot, Foot, Array], row: Any) -> tuple[tuple[Foot, Foot, Array], None]:
         number, nodes, ball = row
         off = point - ball[:3]
 
-        def nearer() -> Foot:
+        def nearer() -> tuple[Foot, Foot, Array]:
+            any_, own, behind = best
             corners = skin.position[nodes]
             share = _share(corners, point)
-            way = point - _at(corners, share)
-            own = Foot(way @ way, number, share)
-            return jax.tree.map(lambda new, old: jnp.where(own.square < best.square, new, old), own, best)
+            way, out = point - _at(corners, share), jnp.cross(*_sides(corners, share))
+            new = Foot(way @ way, number, share)
+            mine = (out @ side >= 0) & (new.square < own.square)
+            behind = jnp.where(mine, out @ way < 0, behind)
+            return _either(new.square < any_.square, new, any_), _either(mine, new, own), behind
 
         # (a + b)^2 <= 2 a^2 + 2 b^2: no square root is needed to pass over what is too far
-        return jax.lax.cond(off @ off < 2 * (ball[3] + best.square), nearer, lambda: best), None
+        return jax.lax.cond(off @ off < 2 * (ball[3] + best[1].square), nearer, lambda: best), None
 
     start = Foot(jnp.float32(DEEPEST**2), jnp.int32(0), jnp.zeros(2))
     rows = jnp.arange(len(faces), dtype=jnp.int32), jnp.asarray(faces, jnp.int32), balls
-    found: Foot = jax.lax.scan(look, start, rows)[0]
-    return found
+    (any_, own, behind), _ = jax.lax.scan(look, (start, start, jnp.bool_(False)), rows)
+    return _either(behind, own, any_)
+
+
+def _either(first: Array, one: Foot, other: Foot) -> Foot:
+    """Return one foot or the other."""
+    return jax.tree.map(lambda a, b: jnp.where(first, a, b), one, other)
 
 
 def _end(skin: Skin, nodes: Array, foot: Foot, part: Array, middle: Array, radius: Array) -> End:

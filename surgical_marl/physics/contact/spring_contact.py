@@ -43,14 +43,21 @@ class Stretches(NamedTuple):
     """Number of contacts, []."""
 
 
-def feel(end: End, moved: Array) -> Felt:
-    """Return the force of one contact whose point moves by this much relative to the shape, m, [3]."""
+def feel(end: End, moved: Array, before: Array | None = None) -> Felt:
+    """Return the force of one contact whose point moves by this much relative to the shape, m, [3].
+
+    `before` is what the last Newton step said, m, [3]. Friction is by the smaller of both normal forces then: where a
+    contact has just closed, the first one says nothing yet, and would stick to what does not press at all.
+    """
     along = end.normal @ moved
     reach, both = end.depth - along, end.bilateral
     normal = end.stiffness * jnp.where(both, reach, jnp.maximum(reach, 0.0))
     slid = end.stretch - end.normal * (end.normal @ end.stretch) + moved - end.normal * along
     far = jnp.sqrt(jnp.maximum(slid @ slid, 1e-24))
-    secant = jnp.where(both, end.stiffness, jnp.minimum(end.stiffness, end.sliding * normal / far))
+    bears = normal
+    if before is not None:
+        bears = jnp.minimum(normal, end.stiffness * jnp.maximum(end.depth - end.normal @ before, 0.0))
+    secant = jnp.where(both, end.stiffness, jnp.minimum(end.stiffness, end.sliding * bears / far))
     pressed = jnp.where(both | (reach > 0), end.stiffness, 0.0)
     stiffness = secant * jnp.eye(3) + (pressed - secant) * jnp.outer(end.normal, end.normal)
     return Felt(normal * end.normal - secant * slid, stiffness, secant / end.stiffness * slid)

@@ -111,6 +111,8 @@ class Newton(NamedTuple):
     factors: Factors
     joined: Any
     """Whatever `join` has found last."""
+    before: Array
+    """Displacements before the Newton step that led to `shift`, m, [n, 3]."""
 
 
 def free_forces(rod: Rod, state: ChainState, dt: Any) -> Array:
@@ -119,7 +121,8 @@ def free_forces(rod: Rod, state: ChainState, dt: Any) -> Array:
 
 
 def search(
-    rod: Rod, state: ChainState, pull: Array, load: Callable[[Array], Loaded], dt: Any, iterations: int, holds: Any,
+    rod: Rod, state: ChainState, pull: Array, load: Callable[[Array, Array], Loaded], dt: Any, iterations: int,
+    holds: Any,
     join: Callable[[Array, Array, Array, Factors, Any], tuple[Array, Array, Any]] | None = None, joined: Any = (),
 ) -> Newton:  # fmt: skip
     """Return the Newton iterations of a step, the last of which is not yet added to the displacements.
@@ -128,7 +131,7 @@ def search(
         rod: the material.
         state: at the start of the step.
         pull: `free_forces`, and other forces on nodes that do not depend on their displacements, N, [n, 3].
-        load: takes displacements [n, 3], returns the forces of contacts there.
+        load: takes displacements, and those of the Newton step before, [n, 3]; returns the forces of contacts there.
         dt: duration of the step, s.
         iterations: Newton steps at most.
         holds: 1 for edges that hold, 0 for a broken one and after the last node, [n].
@@ -149,14 +152,16 @@ def search(
     def step(loop: tuple[Newton, Array, Array]) -> tuple[Newton, Array, Array]:
         found, _, count = loop
         u, q, edges = _taken(found, apart)
-        factors, reduced = _eliminate(rod, u, q, edges, known, load(u))
+        factors, reduced = _eliminate(rod, u, q, edges, known, load(u, found.shift))
         (change, most), kept = _back(rod, bends, factors, reduced), found.joined
         if join is not None:
             change, most, kept = join(u, change, most, factors, kept)
-        return Newton(u, q, _shortened(change, FARTHEST * rod.length, most), factors, kept), most, count + 1
+        change = _shortened(change, FARTHEST * rod.length, most)
+        return Newton(u, q, change, factors, kept, found.shift), most, count + 1
 
     empty = Factors(*(jnp.zeros((n, *shape)) for shape in ((6,), (3,), (), (3, 3), (3,))))
-    start = Newton(jnp.zeros((n, 3)), state.tension, guess, empty, joined), jnp.float32(jnp.inf), jnp.int32(0)
+    still = jnp.zeros((n, 3))
+    start = Newton(still, state.tension, guess, empty, joined, still), jnp.float32(jnp.inf), jnp.int32(0)
     found: Newton = jax.lax.while_loop(going, step, start)[0]
     return found
 

@@ -41,8 +41,9 @@ from surgical_marl.physics.systems.system import (
 from surgical_marl.physics.tree_utils import row_of
 from surgical_marl.scenes.objects import JAW, LINK
 
-TIE = 2e4
-"""Stiffness of a tie, N/m: a pull of 1 N stretches it by 50 um."""
+TIE = 1e4
+"""Stiffness of a tie, N/m: a pull of 1 N stretches it by 0.1 mm. Two that hold one thread reckon with each other's last
+acceleration, which is stable for a needle and a jaw of 0.7 kg while all between them is below 9.5 kN/m."""
 
 
 class Sewing(NamedTuple):

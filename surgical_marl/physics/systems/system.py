@@ -54,6 +54,8 @@ class Shapes(NamedTuple):
     """Largest speed of any point of it, m/s, [p]."""
     clusters: Clusters | None = None
     """Of many spheres. Then nothing else that is computed here is read."""
+    side: Array | None = None
+    """Direction from the skin that each part was near in the last step, [p, 3]; 0 for none."""
 
 
 class Tie(NamedTuple):

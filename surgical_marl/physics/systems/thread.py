@@ -18,6 +18,7 @@ import numpy as np
 from jax import Array
 
 from surgical_marl.content import unknown
+from surgical_marl.physics.contact.skin_detection import sides
 from surgical_marl.physics.contact.spring_contact import Felt, Stretches, each, feel, none, pushes, recall, remember
 from surgical_marl.physics.solver.cholesky import FULL, LOWER
 from surgical_marl.physics.systems import crossings
@@ -42,8 +43,9 @@ from surgical_marl.scenes.objects import Placement, Surface
 from surgical_marl.scenes.thread_file import ThreadFile
 from surgical_marl.untrusted.schema import Place
 
-ITERATIONS = 4
-"""Newton steps of a physics step."""
+ITERATIONS = 20
+"""Newton steps of a physics step at most. One to three are enough but where stiff thread slides over what is not flat:
+it takes up to 20 to find which edges bear it, and friction of edges that do not would stop it at once."""
 SPARE, SEWN = 24, 32
 """Room for contacts beyond one for each edge: a thread may lie on a board, and be held by jaws too, and one behind a
 needle may be in tissue, which holds an edge at several places."""
@@ -62,6 +64,8 @@ class ThreadState(NamedTuple):
     """1 for edges that hold, 0 for a broken one and after the last node, [n]."""
     still: Array
     """True if nothing that moves touches it, and no node moved further than `ENOUGH` in this step and the last, []."""
+    side: Array
+    """Direction from the tissue that each edge is near, [n - 1, 3]; 0 for none."""
 
 
 class ThreadView(NamedTuple):
@@ -175,13 +179,15 @@ class Thread(Soft):
         still = jnp.zeros((self.nodes, 3), jnp.float32)
         holds = jnp.asarray(np.append(np.ones(self.nodes - 1), 0.0), jnp.float32)
         chain = ChainState(position, still, still[:, 0])
-        return ThreadState(chain, none(self.contacts), none(self.crossings), holds, jnp.bool_(False))
+        return ThreadState(
+            chain, none(self.contacts), none(self.crossings), holds, jnp.bool_(False), jnp.zeros((self.nodes - 1, 3))
+        )  # fmt: skip
 
     def shapes(self, state: ThreadState) -> Shapes:
         position = state.chain.position
         speed = jnp.sqrt(jnp.sum(state.chain.velocity * state.chain.velocity, -1))
         radius = np.full(self.nodes - 1, self.diameter / 2, np.float32)
-        return Shapes(position[:-1], position[1:], radius, jnp.maximum(speed[:-1], speed[1:]))
+        return Shapes(position[:-1], position[1:], radius, jnp.maximum(speed[:-1], speed[1:]), side=state.side)
 
     def free_motion(self, state: ThreadState, dt: Any) -> Array:
         """Return inertia and weight of the nodes, N, [n, 3]."""
@@ -200,8 +206,8 @@ class Thread(Soft):
         )
         pairs = recall(state.rubbed, pairs, self.nodes - 1)
 
-        def load(u: Array) -> Loaded:
-            felt = _load(ends, u)
+        def load(u: Array, before: Array) -> Loaded:
+            felt = _load(ends, u, before)
             return felt._replace(force=crossings.add_forces(pairs, u, felt.force))
 
         def join(
@@ -217,7 +223,7 @@ class Thread(Soft):
 
         def at_end(row: Array, end: End) -> tuple[Array, Array]:
             del row
-            felt = _feel(end, _point(end, found.shift) - end.shift)
+            felt = _feel(end, *(_point(end, u) - end.shift for u in (found.shift, found.before)))
             force = felt.force - felt.stiffness @ _point(end, found.change[:, :3])
             return -force, felt.stiffness[LOWER]
 
@@ -251,7 +257,8 @@ class Thread(Soft):
             holds = jnp.where(chain.tension > self.strength, 0.0, holds)
         pairs = response.solved.pairs
         rubbed = remember(pairs, lambda row, end: crossings.apart(end, u), self.nodes - 1)
-        return ThreadState(chain, stretches, rubbed, holds, (ends.moving == 0) & (most < ENOUGH))
+        side = state.side if ends.rows.on is None else sides(own, self.nodes - 1)
+        return ThreadState(chain, stretches, rubbed, holds, (ends.moving == 0) & (most < ENOUGH), side)
 
     def strand(self, state: ThreadState, body: str) -> Strand | None:
         for tie in self.ties:
@@ -300,9 +307,9 @@ def _tie(
     return Tie(part, share, name, tuple(others[name].object.sites[TAIL][0].tolist()))
 
 
-def _feel(end: End, moved: Array) -> Felt:
+def _feel(end: End, moved: Array, before: Array) -> Felt:
     """Return the force of a contact with a shape, or with a place inside of tissue, whose point moves by this much."""
-    felt = feel(end, moved)
+    felt = feel(end, moved, before)
     if end.on is None:
         return felt
     held = end.bilateral & (end.shape < 0)
@@ -321,12 +328,12 @@ def _spread(rows: Array, part: Array, first: Array, second: Array) -> Array:
     return rows.at[part + 1].add(second, mode="promise_in_bounds")
 
 
-def _load(ends: Ends, u: Array) -> Loaded:
-    """Return the forces of contacts on the nodes at displacements u, m, [n, 3]."""
+def _load(ends: Ends, u: Array, before: Array) -> Loaded:
+    """Return the forces of contacts on the nodes at displacements u, and before the last Newton step, m, [n, 3]."""
 
     def add(row: Array, sums: Loaded) -> Loaded:
         end = row_of(ends.rows, row)
-        felt = _feel(end, _point(end, u) - end.shift)
+        felt = _feel(end, _point(end, u) - end.shift, _point(end, before) - end.shift)
         first, second, falls = 1 - end.share, end.share, felt.stiffness[LOWER]
         return Loaded(
             _spread(sums.force, end.part, first * felt.force, second * felt.force),

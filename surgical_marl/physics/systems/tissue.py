@@ -81,6 +81,23 @@ class TissueView(NamedTuple):
     """True once it has been stretched past `tears`, [] bool."""
     channels: ChannelView | None = None
     """Where needles go or went through it; None if none can."""
+    tip_force: Any = 0.0
+    """The largest normal force of a needle's tip on a face of it, N, []."""
+
+    @property
+    def bite_depth(self) -> Array:
+        """Depth of the deepest channel below the upper face at rest, m, []."""
+        return jnp.max(self.channels.depth) if self.channels else jnp.float32(0.0)
+
+    @property
+    def swept(self) -> Array:
+        """Largest way of a needle across its centre line in a channel, m, []."""
+        return jnp.max(self.channels.swept) if self.channels else jnp.float32(0.0)
+
+    @property
+    def channel_count(self) -> Array:
+        """Number of channels, []."""
+        return jnp.sum(self.channels.there) if self.channels else jnp.int32(0)
 
 
 class Solved(NamedTuple):
@@ -128,7 +145,6 @@ class Tissue(Soft, SkinnedSystem):
     """The needles that may."""
     file: ClassVar[type] = TissueFile
     """The content of its file."""
-    reports: ClassVar[tuple[str, ...]] = ("tissue_force",)
 
     @classmethod
     def placed(cls, item: Placement, entry: Any, others: Mapping[str, Placement], place: Place) -> Tissue:
@@ -183,6 +199,11 @@ class Tissue(Soft, SkinnedSystem):
         if not (self.channel and self.needles):
             return None
         return Channels(self.channel, self.needles, self.grid, len(self.points.nodes), self.surface.stiffness)
+
+    @property
+    def reports(self) -> tuple[str, ...]:  # type: ignore[override]
+        of_channels = ("bite_depth", "swept", "channel_count", "tip_force")
+        return ("tissue_force", *(of_channels if self.channels else ()))
 
     @property
     def follows(self) -> tuple[str, ...]:  # type: ignore[override]
@@ -272,10 +293,11 @@ class Tissue(Soft, SkinnedSystem):
         return TissueState(nodes, stretches, *hardest(ends, answer.force), torn, channels)
 
     def view(self, state: TissueState) -> TissueView:
-        channels, inner = None, state.channels
-        if self.channels and inner:
-            channels = self.channels.view(inner, state.nodes.position)
-        return TissueView(*state.nodes, state.force, state.place, state.torn, channels)
+        seen = TissueView(*state.nodes, state.force, state.place, state.torn)
+        if not (self.channels and state.channels):
+            return seen
+        channels = self.channels.view(state.channels, state.nodes.position)
+        return seen._replace(channels=channels, tip_force=jnp.max(state.channels.tips.pressed))
 
     def _step(self, dt: Any) -> TissueStep:
         return TissueStep(self.solver, self.tears, dt, self.channels)
