@@ -74,7 +74,7 @@ BESIDE = 0.010
 """Distance from the lesion along the edge at which the flap is pinched, towards the second arm, m: the tool of that
 one leans to its own side, over this part of the flap."""
 TURNED, SHIFTED = 0.1, 0.01
-"""How far a joint that turns, rad, or slides, m, is off home at the start at `default`; a jaw is not."""
+"""Largest distance of a joint that turns, rad, or slides, m, from home at the start at `default`; a jaw has none."""
 SAG = 0.0065
 """Distance by which the edge hangs below where it is without weight, m: to find out what arms can reach."""
 LEAN, DEEP, BEFORE = np.radians(55.0), 0.003, 0.012
@@ -98,7 +98,7 @@ class RetractLevel(NamedTuple):
     extent: tuple[float, float]
     """Half the size of the part in which the lesion is, along the edge and across it, m."""
     off: float
-    """How far joints are off home at the start, in units of `TURNED` and `SHIFTED`."""
+    """Distance of joints from home at the start, in units of `TURNED` and `SHIFTED`."""
 
 
 class Best(NamedTuple):

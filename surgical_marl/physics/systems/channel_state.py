@@ -55,8 +55,8 @@ class ChannelState(NamedTuple):
     thread: Array
     """Number of the needle whose thread is in it, [c]; -1 for none."""
     along: Array
-    """How far behind that needle the spring of friction of each place holds the thread, m, [c, p]; `OFF` of places that
-    do not hold the thread yet."""
+    """Distance behind that needle at which the spring of friction of each place holds the thread, m, [c, p]; `OFF` of
+    places that do not hold the thread yet."""
     tips: Tips
 
 

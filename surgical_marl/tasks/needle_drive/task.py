@@ -292,7 +292,7 @@ class Task(Base):
 
     @property
     def _deepest(self) -> float:
-        """How far below its start the needle may come, m."""
+        """Distance below its start that the needle may come, m."""
         return LOST if self.level.picks else 0.08
 
     def better(self, best: Best, now: Now) -> Best:
