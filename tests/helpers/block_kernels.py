@@ -38,6 +38,8 @@ def has_clang() -> bool:
     return bool(kernel.wp._src.context.runtime.llvm)
 
 
+STRIDE = 8
+"""Columns of the arrays, of which the first is the environment's: a kernel that takes numbers for neighbours fails."""
 DEVICES = [
     pytest.param("cpu", marks=pytest.mark.skipif(not has_clang(), reason="needs Warp's compiler for a CPU")),
     pytest.param("cuda", marks=pytest.mark.skipif(not kernel.has_cuda(), reason="needs a CUDA device")),
@@ -68,16 +70,16 @@ def run_block(device: str, function: Callable[..., Any], *arguments: Any) -> dic
     """Return the results of a stage by name, of its CUDA code, for one environment."""
     laid = _laid(function, arguments)
     source: Any = SimpleNamespace(sizes=laid.layout.sizes)
-    arrays: Any = make_arrays(device, source, tables(Graph()), 1, 1)
+    arrays: Any = make_arrays(device, source, tables(Graph()), STRIDE, 1)
     for leaf, values in zip(laid.reads.values(), laid.inputs, strict=True):
         arrays.write(leaf, values[None])
     if device == "cpu":
         with gpu_code():
             body = _ON_A_CPU + laid.body(1)
-            kernel.compile_kernels({"block": body}, "cpu")["block"].launch(arrays.all, 1, 0, 1)
+            kernel.compile_kernels({"block": body}, "cpu")["block"].launch(arrays.all, STRIDE, 0, 1)
     else:
         threads = laid.call.threads
-        kernel.compile_block("block", laid.body(threads), threads).launch(arrays.all, 1, 1)
+        kernel.compile_block("block", laid.body(threads), threads).launch(arrays.all, STRIDE, 1)
     return {name: arrays.read(leaf, "numpy")[0] for name, leaf in laid.writes.items()}
 
 

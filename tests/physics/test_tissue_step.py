@@ -90,6 +90,31 @@ def test_cuda_code_computes_what_jax_does(sheet: str, contacts: int, q: int, dev
     close(run_block(device, step.move, *args), move(*args), contacts, 2e-6)
 
 
+@pytest.mark.parametrize("device", DEVICES)
+def test_no_brick_is_crushed_in_a_step(device: str) -> None:
+    """Nodes are pushed through the sheet; all go less far, and contacts press by that."""
+    tissue, (step, _, move) = SHEETS["sheet"], step_of("sheet")
+    nodes, (held, ends) = shaken(tissue, 1e-4), touched(tissue, 0)
+    rng, rest, pushed = np.random.default_rng(3), tissue.rest, jnp.zeros((ROOM, 3))
+    shift = 2e-4 * rng.normal(size=rest.shape) * tissue.solver.free[:, None]
+    struck = np.flatnonzero((rest[:, 0] > 0.012) & (rest[:, 0] < 0.018) & (rest[:, 1] == 0) & (rest[:, 2] > 0.004))
+    assert len(struck)
+    shift[struck] += [0, 0, -0.02]
+    answer: Any = jax.tree.map(lambda x: jnp.zeros(x.shape), jax.eval_shape(step.respond, nodes, held, ends))
+    args = nodes, held, ends, answer._replace(shift=jnp.asarray(shift, jnp.float32)), pushed
+    moved = move(*args)
+    before, after = (volumes(tissue, x) for x in (nodes.position, moved.position))
+    assert (after > 0.399 * before).all() and (after < 0.8 * before).any()
+    close(run_block(device, step.move, *args), moved, 0, 2e-6)
+
+
+def volumes(tissue: Tissue, position: Any) -> np.ndarray:
+    """Volumes of the bricks in their middles, as shares of those at rest, [e]."""
+    corners = np.asarray(position)[tissue.grid.first[:, None] + tissue.grid.offsets].reshape(-1, 2, 2, 2, 3)
+    sides = [np.diff(corners, axis=axis).mean((1, 2, 3)) for axis in (1, 2, 3)]
+    return np.linalg.det(np.stack(sides, 1)) / np.prod(tissue.grid.cell)
+
+
 @pytest.mark.skipif(not kernel.has_cuda(), reason="needs a CUDA device")
 def test_a_gpu_pushes_it_as_a_cpu_does(tmp_path: Path) -> None:
     found = []

@@ -175,8 +175,10 @@ const auto improve = [&](int springs, int most, float enough) {
 
 // Adds the rigid motion to u and p by which forces that are left have no sum and no torque, as `balanced` does.
 const auto balance = [&](const float left[][3], int springs) {
-    float sums[28] = {};
-    const float *centre = &in.nodes_position[NODES / 2 * 3];
+    float sums[28] = {}, *x = each;
+    const float *centre = x + NODES / 2 * 3;
+    for (int k = thread; k < 3 * NODES; k += threads) x[k] = in.nodes_position[k];
+    __syncthreads();
     const auto add = [&](const float *place, const float *falls) {
         float columns[6][3];
         Block::motions(place, centre, columns);
@@ -191,13 +193,13 @@ const auto balance = [&](const float left[][3], int springs) {
     EACH_NODE(a, n) {
         float columns[6][3];
         const float falls[6] = {inertia[a], 0.0f, inertia[a], 0.0f, 0.0f, inertia[a]};
-        add(&in.nodes_position[3 * n], falls);
-        Block::motions(&in.nodes_position[3 * n], centre, columns);
+        add(x + 3 * n, falls);
+        Block::motions(x + 3 * n, centre, columns);
         for (int i = 0; i < 6; i++) sums[21 + i] += Vector::dot(columns[i], left[a]);
     }
     for (int c = thread; c < springs; c += threads) {
         float place[3];
-        Block::point(&in.nodes_position[0], nodes + HELD * c, weights + HELD * c, place);
+        Block::point(x, nodes + HELD * c, weights + HELD * c, place);
         add(place, stiffness + 6 * c);
     }
     UNROLL
@@ -209,11 +211,35 @@ const auto balance = [&](const float left[][3], int springs) {
     __syncthreads();
     EACH_NODE(a, n) {
         float columns[6][3];
-        Block::motions(&in.nodes_position[3 * n], centre, columns);
+        Block::motions(x + 3 * n, centre, columns);
         for (int i = 0; i < 3; i++) {
             for (int k = 0; k < 6; k++) u[a][i] += free[a] * columns[k][i] * rigid[21 + k];
             p[3 * n + i] = u[a][i];
         }
     }
+    __syncthreads();
+};
+
+// Makes the displacements in p as much shorter as no brick is crushed, as `shortened` does; places come to `each`.
+const auto shorten = [&]() {
+    float length = 1.0f, *x = each;
+    __syncthreads();
+    for (int k = thread; k < 3 * NODES; k += threads) x[k] = in.nodes_position[k];
+    __syncthreads();
+    for (bool crushed = true; crushed;) {
+        bool any = false;
+        for (int e = thread; e < BRICKS; e += threads) {
+            float before[24], after[24];
+            Block::corners(x + 3 * in.mesh_bricks[e], before);
+            Block::corners(p + 3 * in.mesh_bricks[e], after);
+            for (int i = 0; i < 24; i++) after[i] = before[i] + length * after[i];
+            any |= Brick::volume(after) < LEFT * Brick::volume(before);
+        }
+        crushed = __syncthreads_or(any);
+        if (crushed) length = length > SHORTEST ? length / 2 : 0.0f;
+        crushed = crushed && length > 0;
+    }
+    if (length < 1)
+        for (int k = thread; k < 3 * NODES; k += threads) p[k] *= length;
     __syncthreads();
 };

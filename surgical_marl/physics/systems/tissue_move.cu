@@ -25,29 +25,10 @@ if (moving > 0) {
         balance(left, 0);
     }
 }
+for (int k = thread; k < 3 * NODES; k += threads) p[k] = in.shift[k] + (moving > 0 ? p[k] : 0.0f);
+shorten();
 for (int k = thread; k < 3 * NODES; k += threads) {
-    x[k] = in.nodes_position[k];
-    p[k] = in.shift[k] + (moving > 0 ? p[k] : 0.0f);
-}
-__syncthreads();
-
-float length = 1.0f;
-for (bool crushed = true; crushed;) {
-    bool any = false;
-    for (int e = thread; e < BRICKS; e += threads) {
-        float before[24], after[24];
-        Block::corners(x + 3 * in.mesh_bricks[e], before);
-        Block::corners(p + 3 * in.mesh_bricks[e], after);
-        for (int i = 0; i < 24; i++) after[i] = before[i] + length * after[i];
-        any |= Brick::volume(after) < LEFT * Brick::volume(before);
-    }
-    crushed = __syncthreads_or(any);
-    if (crushed) length = length > SHORTEST ? length / 2 : 0.0f;
-    crushed = crushed && length > 0;
-}
-for (int k = thread; k < 3 * NODES; k += threads) {
-    p[k] *= length;
-    x[k] += p[k];
+    x[k] = in.nodes_position[k] + p[k];
     out.position[k] = x[k];
     out.velocity[k] = p[k] / DT;
 }

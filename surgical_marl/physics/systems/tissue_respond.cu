@@ -116,6 +116,7 @@ if (LOOSE) {
     balance(left, rows);
 }
 
+shorten();
 for (int k = thread; k < 3 * NODES; k += threads) out.shift[k] = p[k];
 for (int c = thread; c < rows; c += threads) {
     float moved[3], felt[3], eased[6] = {0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f};

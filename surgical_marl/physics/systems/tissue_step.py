@@ -133,7 +133,7 @@ class TissueStep:
         grid, (rows, q) = self.solver.grid, held.nodes.shape
         threads = min(MOST_THREADS, 32 * -(-grid.nodes // 64))
         shared = 4 * (12 * grid.nodes + PAD * len(grid.first) + rows * (12 + 3 * q)) + 2 * grid.nodes + 640
-        if shared > MOST_SHARED:
+        if shared > MOST_SHARED or 3 * grid.nodes > PAD * len(grid.first):  # kernels keep nodes where bricks were
             return reference
         return block_stage(reference, self.cuda(kernel, held), threads, f"tissue_{kernel}")
 
@@ -183,6 +183,7 @@ class TissueStep:
             if load:
                 left += load.force - load.falls(u)
             u += solver.balanced(nodes.position, left, linear.inertia, springs)
+        u = solver.shortened(nodes, u)  # tissue that is crushed presses back by what it really gives way
         force = each(ends, pulls)
 
         beside, across = self.softness
