@@ -179,7 +179,7 @@ def test_the_shipped_settings_load() -> None:
         ("network.hidden=[]", "network.hidden must hold one or more whole numbers, not "),
         ("network.hidden=[8, x]", "network.hidden.1 must be a whole number"),
         ("ppo=3", "ppo must be a mapping of settings, not 3"),
-        ("constraint.cost=crash", "constraint.cost must be one of none, collision, .*speed, not 'crash'"),
+        ("constraint.cost=crash", "constraint.cost must be one of none, collision, .*tissue, not 'crash'"),
         ("constraint.limit=2", "constraint.limit must be a number from 0 to 1, not 2"),
         ("constraint.kp=-1", "constraint.kp must be a number from 0 to"),
         ("ppo.normalise_values=1", "ppo.normalise_values must be true or false, not 1"),
