@@ -114,7 +114,7 @@ springs: {right: 1.0e+6}
 friction: {sliding: 1, torsion: 0}
 stiffness: 5000
 tears: 2
-channels: {most: 1, puncture: 1, cutting: 1, friction: 1, stiffness: 1000, spacing: 0.001}
+channels: {most: 1, puncture: 1, cutting: 1, friction: 1, thread_friction: 1, stiffness: 1000, spacing: 0.001}
 colour: [1, 0, 0]
 """,
 }
