@@ -185,6 +185,7 @@ def test_a_stitch_holds_both_edges_together(bench: Bench, stitched: Hands) -> No
     assert channels(hands).thread.tolist() == [0, 0, -1, -1] and held.left_out.max() == 0
 
 
+@pytest.mark.slow
 def test_a_thread_runs_through_four_channels(stitched: Hands) -> None:
     """A running suture: down and up through both edges, twice. All of them hold it, by friction in each."""
     hands, aside = stitched.copy(), np.array([0.006, 0.0])
@@ -208,6 +209,7 @@ def test_a_start_forgets_what_was_sewn(bench: Bench, threaded: Hands) -> None:
     assert np.abs(first.load).max() == 0
 
 
+@pytest.mark.slow
 def test_a_kernel_holds_a_thread_as_jax_does(threaded: Hands, stitched: Hands) -> None:
     """Places on needle and thread, which parts are inside, and the forces on the nodes."""
     drawn = threaded.copy()
@@ -218,7 +220,7 @@ def test_a_kernel_holds_a_thread_as_jax_does(threaded: Hands, stitched: Hands) -
         needles = bodies_at(origin, axes)._replace(strands=(bench.strand.strand(thread, "pin"),))
         now, _ = bench.tissue.follow(tissue, no_ends(bench.tissue), needles, DT)
         ends = bench.tissue.held(now, needles, 0, bench.step._couplings["thread"]._detection.nothing(NOWHERE), 0)
-        return now.channels, bench.tissue.inside(now, needles, 0), ends.total, _load(ends, u).force
+        return now.channels, bench.tissue.inside(now, needles, 0), ends.total, _load(ends, u, u).force
 
     states = [jax.tree.map(lambda *rows: np.stack(rows), *(one.physics.systems[name] for one in hands))
               for name in ("thread", "sheet")]  # fmt: skip
@@ -228,7 +230,7 @@ def test_a_kernel_holds_a_thread_as_jax_does(threaded: Hands, stitched: Hands) -
     columns = *states, origins, axes, u
     found, expected = run(step, *columns), jax.jit(jax.vmap(step))(*columns)
     (channels, inside, total, force), (wanted, *rest) = found, expected
-    assert total.tolist() == rest[1].tolist() and total.min() >= 3 and inside.any(1).all()
+    assert total.tolist() == rest[1].tolist() and total.min() >= 2 and inside.any(1).all()
     np.testing.assert_array_equal(inside, rest[0])
     np.testing.assert_allclose(force, rest[2], atol=2e-5 * np.abs(rest[2]).max())
     for name in ("along", "slip", "needle", "thread"):

@@ -97,6 +97,7 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:
     return Scene(tmp_path_factory.mktemp("weave"))
 
 
+@pytest.mark.slow
 def test_tissue_bears_the_weight_of_a_thread(scene: Scene) -> None:
     after, seen = scene.run(scene.home, 160)
     late = scene.on_thread(seen, [0.0, 0.0, 0.0])[80:]

@@ -237,6 +237,7 @@ def beside_pads(scene: Any, qpos: np.ndarray, points: np.ndarray) -> float:
     return least
 
 
+@pytest.mark.slow
 def test_a_jaw_gathers_tissue_lifts_it_and_holds_it_for_ten_seconds(tmp_path: Path) -> None:
     """An open jaw presses the sheet down, closes on a fold of it, and goes up until it is 5 mm above the sheet."""
     env = BatchedEnv("reach", scene_file(tmp_path), num_envs=2, engine="fused", device="cpu", max_steps=10**6)

@@ -46,8 +46,8 @@ class Stretches(NamedTuple):
 def feel(end: End, moved: Array, before: Array | None = None) -> Felt:
     """Return the force of one contact whose point moves by this much relative to the shape, m, [3].
 
-    `before` is what the last Newton step said, m, [3]. Friction is by the smaller of both normal forces then: where a
-    contact has just closed, the first one says nothing yet, and would stick to what does not press at all.
+    `before` is the motion that the last Newton step found, m, [3]. A contact that was open there has no friction yet: it
+    would stick to what may not press at all.
     """
     along = end.normal @ moved
     reach, both = end.depth - along, end.bilateral
@@ -56,7 +56,7 @@ def feel(end: End, moved: Array, before: Array | None = None) -> Felt:
     far = jnp.sqrt(jnp.maximum(slid @ slid, 1e-24))
     bears = normal
     if before is not None:
-        bears = jnp.minimum(normal, end.stiffness * jnp.maximum(end.depth - end.normal @ before, 0.0))
+        bears = jnp.where(end.depth > end.normal @ before, normal, 0.0)
     secant = jnp.where(both, end.stiffness, jnp.minimum(end.stiffness, end.sliding * bears / far))
     pressed = jnp.where(both | (reach > 0), end.stiffness, 0.0)
     stiffness = secant * jnp.eye(3) + (pressed - secant) * jnp.outer(end.normal, end.normal)
