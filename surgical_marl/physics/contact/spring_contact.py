@@ -46,8 +46,8 @@ class Stretches(NamedTuple):
 def feel(end: End, moved: Array, before: Array | None = None) -> Felt:
     """Return the force of one contact whose point moves by this much relative to the shape, m, [3].
 
-    `before` is the motion that the last Newton step found, m, [3]. A contact that was open there has no friction yet: it
-    would stick to what may not press at all.
+    `before` is the motion that the last Newton step found, m, [3]. A contact that was open there has no friction yet:
+    it would stick to what may not press at all.
     """
     along = end.normal @ moved
     reach, both = end.depth - along, end.bilateral
