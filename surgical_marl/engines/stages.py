@@ -28,6 +28,8 @@ from jax.extend import core
 from jax.interpreters import ad, batching, mlir
 
 R = TypeVar("R")
+MOST_SHARED = 48 * 1024
+"""Memory that the threads of a block can share on any GPU, bytes."""
 
 
 class Call(NamedTuple):

@@ -17,14 +17,12 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from surgical_marl.engines.stages import block_stage
+from surgical_marl.engines.stages import MOST_SHARED, block_stage
 from surgical_marl.physics.systems.brick_grid import SurfacePoints
 from surgical_marl.physics.systems.system import Clusters, Ends, Shapes
 
 THREADS = 128
 """Of a block."""
-MOST_SHARED = 48 * 1024
-"""Memory that the threads of a block can share, bytes."""
 
 
 class NodeBalls(NamedTuple):

@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from surgical_marl.engines.stages import block_stage
+from surgical_marl.engines.stages import MOST_SHARED, block_stage
 from surgical_marl.physics.contact.spring_contact import each, feel
 from surgical_marl.physics.solver.cholesky import FULL, LOWER
 from surgical_marl.physics.systems.brick import CRUSHED, ITERATIONS, RESISTANCE
@@ -40,8 +40,6 @@ PUSHES, LITTLE = 6, 1e-12
 """Conjugate gradients for displacements by additional forces on contacts, and the residual at which these stop, J."""
 MOST_THREADS, PAD = 256, 25
 """Threads of a block, and numbers in shared memory for a brick: one more than needed, so that threads use all banks."""
-MOST_SHARED = 48 * 1024
-"""Memory that the threads of a block can share, bytes."""
 
 R = TypeVar("R")
 
