@@ -153,6 +153,20 @@ def test_a_rotation_is_the_nearest_one_also_inside_out() -> None:
     np.testing.assert_allclose(found, turns, atol=2e-6)
 
 
+def test_a_rotation_is_the_nearest_one_of_bricks_that_are_drawn_out_and_flattened() -> None:
+    """Sides have ratios of up to 100, so edges are nearly parallel; and one that was met under a tool."""
+    rng = np.random.default_rng(0)
+    turns = np.linalg.qr(rng.normal(size=(2, 2000, 3, 3)))[0]
+    stretch = np.exp(rng.uniform(np.log(0.05), np.log(5), (2000, 1, 3)))
+    met = np.array([[1.304, 1.5666, -0.0046], [-1.2026, -1.0681, -0.0274], [1.3389, 2.0791, 0.3517]])
+    drawn = turns[0] * stretch @ turns[1]
+    drawn *= np.sign(np.linalg.det(drawn))[:, None, None]
+    drawn[0] = met
+    u, _, v = np.linalg.svd(drawn)
+    found = jax.jit(jax.vmap(polar_rotation))(jnp.asarray(drawn, jnp.float32))
+    np.testing.assert_allclose(found, u @ v, atol=1e-5)
+
+
 def test_a_crushed_brick_pushes_back_much_harder() -> None:
     def pressure(share: float) -> float:
         x = jnp.asarray(CORNER * [1, 1, share], jnp.float32)

@@ -103,9 +103,22 @@ struct Brick {
         to_modes(forces);
     }
 
-    // The rotation nearest to a gradient.
+    // The rotation nearest to a gradient, by Newton's method from one of nearly equal stretches.
     __device__ void rotate(const float *gradient) {
-        float first[3] = {gradient[0], gradient[3], gradient[6]}, second[3] = {gradient[1], gradient[4], gradient[7]}, third[3];
+        float even[9], c[9];
+        UNROLL
+        for (int i = 0; i < 9; i++) even[i] = gradient[i];
+        for (int step = 0; step < EVENED; step++) {
+            Vector::cross(even + 3, even + 6, c);
+            Vector::cross(even + 6, even, c + 3);
+            Vector::cross(even, even + 3, c + 6);
+            const float own = Vector::dot(even, even) + Vector::dot(even + 3, even + 3) + Vector::dot(even + 6, even + 6);
+            const float other = Vector::dot(c, c) + Vector::dot(c + 3, c + 3) + Vector::dot(c + 6, c + 6);
+            const float by = 1.0f / sqrtf(fmaxf(own, 1e-24f)), across = 1.0f / sqrtf(fmaxf(other, 1e-24f));
+            UNROLL
+            for (int i = 0; i < 9; i++) even[i] = by * even[i] + across * c[i];
+        }
+        float first[3] = {even[0], even[3], even[6]}, second[3] = {even[1], even[4], even[7]}, third[3];
         const float length = 1.0f / Vector::size(first);
         for (int i = 0; i < 3; i++) first[i] *= length;
         Vector::cross(first, second, third);

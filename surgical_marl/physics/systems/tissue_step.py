@@ -22,7 +22,7 @@ from jax import Array
 from surgical_marl.engines.stages import MOST_SHARED, block_stage
 from surgical_marl.physics.contact.spring_contact import each, feel
 from surgical_marl.physics.solver.cholesky import FULL, LOWER
-from surgical_marl.physics.systems.brick import CRUSHED, ITERATIONS, RESISTANCE
+from surgical_marl.physics.systems.brick import CRUSHED, EVENED, ITERATIONS, RESISTANCE
 from surgical_marl.physics.systems.brick_solve import LEFT, SHORTEST, BrickSolver, Nodes, Springs
 from surgical_marl.physics.systems.channel import Channels
 from surgical_marl.physics.systems.system import End, Ends, Load
@@ -252,7 +252,7 @@ class TissueStep:
             "STRIDE_X": grid.offsets[4], "STRIDE_Y": grid.offsets[2],
             "HOLDS": self.channels.first if self.channels else -1,
             "PRESSES": self.channels.pressing if self.channels else -1,
-            "ROUNDS": ROUNDS, "TURNS": TURNS, "ALONE": ALONE, "PUSHES": PUSHES, "NEWTON": ITERATIONS,
+            "ROUNDS": ROUNDS, "TURNS": TURNS, "ALONE": ALONE, "PUSHES": PUSHES, "EVENED": EVENED, "NEWTON": ITERATIONS,
         }  # fmt: skip
         diagonal = {
             f"DIAGONAL_{a}{b}": brick.diagonal[0, i, j]
