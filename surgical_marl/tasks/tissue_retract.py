@@ -11,9 +11,11 @@ Action        one number in [-1, 1] for every joint; the jaw opens above 0 and c
 Reward        the same for all arms, but for `clearance` and `collision`; weights in brackets. Progress over the best of
               the episode so far: `reach`, first tool to the edge (20 / m); `pinch`, first hold, half of it for an edge
               between the fingers (2); `lift`, the angle by which the pinched edge is turned up about the side at which
-              the flap hangs (2 / rad); `clear`, the room up to 8 mm while the flap is pinched (4); `touch`, second tool
-              to target while the way is clear (40 / m). Of each step: `success` (0.5), `overload`, more than 8 N on
-              tissue (-0.1), `collision` (-2), `clearance` (0).
+              the flap hangs (2 / rad). Changes of a potential, which are lost again with the hold: `clear`, from 0 to
+              1 as the flap is 8 mm off the straight line from the target to where the second arm comes in, its remote
+              center, while it is pinched (4); `touch`, that times by how much the second tool is nearer to the target
+              than 100 mm (40 / m). Of each step: `precision`, while the way is clear, 1 at the target and a third at 5
+              mm (0.1); `success` (0.5), `overload`, more than 8 N on tissue (-0.1), `collision` (-2), `clearance` (0).
 Success       for 0.2 s the flap is pinched, the second tool's way is clear, its tip is within 2 mm of the target on the
               lesion's upper face, and no shape presses on tissue by more than 8 N. The way leads straight from the
               target to the second tool's wrist, and from there along its shaft. It is clear where the room, the least
@@ -38,7 +40,7 @@ from surgical_marl.scenes.tissue_file import OVERLOAD
 from surgical_marl.tasks.base.grasp_poses import joints_at, moved, tool_of, tool_poses
 from surgical_marl.tasks.base.object_task import NEAR, as_float, known
 from surgical_marl.tasks.base.oracle_script import EARLY, Snapshot, Step, Wish
-from surgical_marl.tasks.base.task import Start
+from surgical_marl.tasks.base.task import PRECISION, Start
 from surgical_marl.tasks.base.task import Task as BaseTask
 from surgical_marl.tasks.base.terms import STRONGEST, Picture, Term
 from surgical_marl.tasks.base.workspace import CLEARANCE, choose
@@ -88,6 +90,8 @@ MARKS = 8
 """Places of the flap that agents observe."""
 WIDE = 0.1
 """Bound of the observed room, m."""
+FAR = 0.1
+"""Distance of the second tool from the lesion at which `touch` begins to be rewarded, m."""
 OPPOSITE = {"left": "right", "right": "left", "front": "back", "back": "front"}
 """Sides of tissue, and those across from them."""
 
@@ -101,8 +105,8 @@ class RetractLevel(NamedTuple):
     """Distance of joints from home at the start, in units of `TURNED` and `SHIFTED`."""
 
 
-class Best(NamedTuple):
-    """The best of an episode so far, [] float32 each."""
+class Progress(NamedTuple):
+    """Progress of an episode: the best so far of the first three, and of the others how it is now; [] float32 each."""
 
     reach: Array
     """Least distance of the first tool from the edge, m; below 0 before the start."""
@@ -111,9 +115,9 @@ class Best(NamedTuple):
     lift: Array
     """Largest angle by which the pinched edge was turned up, rad; `HIGHEST` at most."""
     clear: Array
-    """Largest room while the flap was pinched, from 0 to 1 at `CLEAR`."""
+    """How far a pinched flap is off the second arm's line, from 0 to 1 at `CLEAR`."""
     touch: Array
-    """Least distance of the second tool from the lesion while the way was clear, m; below 0 before the start."""
+    """By how much the second tool is nearer to the lesion than `FAR`, m, times `clear`."""
 
 
 class RetractGoal(NamedTuple):
@@ -121,7 +125,7 @@ class RetractGoal(NamedTuple):
 
     row: Array
     """Row of the tables."""
-    best: Best
+    progress: Progress
     touched: Array
     """Time for which the lesion has been touched now, s."""
     pinched: Array
@@ -144,6 +148,9 @@ class Now(NamedTuple):
     where it hangs in the plane of that side, positive above."""
     room: Array
     """Least distance of the flap from the second tool's way, m."""
+    beside: Array
+    """Least distance of the flap from the straight line from the lesion to the second arm's remote center, m: the way
+    that it will have, wherever its tool is now."""
     away: Array
     """Distance of the second tool's tip from the lesion, m."""
     force: Array
@@ -171,8 +178,8 @@ class Task(BaseTask):
         "hard": RetractLevel((0.014, 0.0045), 2.0),
     }
     weights = {  # noqa: RUF012
-        "reach": 20.0, "pinch": 2.0, "lift": 2.0, "clear": 4.0, "touch": 40.0, "success": 0.5, "overload": -0.1,
-        "clearance": 0.0, "collision": -2.0,
+        "reach": 20.0, "pinch": 2.0, "lift": 2.0, "clear": 4.0, "touch": 40.0, "precision": 0.1, "success": 0.5,
+        "overload": -0.1, "clearance": 0.0, "collision": -2.0,
     }  # fmt: skip
     default_scene = "bimanual_psm_tissue"
     scenes = ("bimanual_psm_tissue",)
@@ -206,8 +213,8 @@ class Task(BaseTask):
     def start(self, key: Array) -> Start:
         """Return where the lesion is, and the postures."""
         row, zero = jax.random.randint(key, (), 0, ROWS), jnp.float32(0.0)
-        unknown = jnp.float32(-1.0)
-        goal = RetractGoal(row, Best(unknown, zero, zero, zero, unknown), zero, zero, jnp.zeros(3, jnp.float32))
+        none = Progress(jnp.float32(-1.0), zero, zero, zero, zero)
+        goal = RetractGoal(row, none, zero, zero, jnp.zeros(3, jnp.float32))
         return Start(goal, self.tables["starts"][row])
 
     # -- what is measured
@@ -224,14 +231,15 @@ class Task(BaseTask):
         nearest = edge[jnp.argmin(jnp.sum(ways * ways, -1))] - flap.hinge
         other, others = self._tool(world, self.second)
         wrist = other - np.float32(WRIST) * others[:, 2]
-        mount = self.scene.mounts[self.second]
-        room = jnp.minimum(_gap(seen.position, point, wrist), _gap(seen.position, wrist, _f32(mount.position)))
+        center = _f32(self.scene.mounts[self.second].position)
+        room = jnp.minimum(_gap(seen.position, point, wrist), _gap(seen.position, wrist, center))
         return Now(
             known(_length(ways[grip])),
             between,
             between & (seen.tissue_force > FELT),
             jnp.arctan2(nearest[2], nearest @ flap.outward),
             known(room),
+            known(_gap(seen.position, point, center)),
             known(_length(other - point)),
             seen.tissue_force,
             edge[grip],
@@ -243,16 +251,16 @@ class Task(BaseTask):
         turn = _f32(mount.rotation)
         return turn @ view.tool_tip + _f32(mount.position), turn @ view.tool_axes
 
-    def better(self, best: Best, now: Now) -> Best:
-        """Return the best so far, with the measurements of this step."""
+    def after(self, progress: Progress, now: Now) -> Progress:
+        """Return the progress with the measurements of this step."""
         lift = jnp.clip(now.lift, 0.0, HIGHEST)
-        room = jnp.clip(now.room / CLEAR, 0.0, 1.0)
-        return Best(
-            jnp.where(best.reach < 0, now.reach, jnp.minimum(best.reach, now.reach)),
-            jnp.maximum(best.pinch, (as_float(now.between) + as_float(now.pinched)) / 2),
-            jnp.where(now.pinched, jnp.maximum(best.lift, lift), best.lift),
-            jnp.where(now.pinched & (now.lift > 0), jnp.maximum(best.clear, room), best.clear),
-            jnp.where(best.touch < 0, now.away, jnp.where(now.clear, jnp.minimum(best.touch, now.away), best.touch)),
+        clear = jnp.where(now.pinched & (now.lift > 0), jnp.clip(now.beside / CLEAR, 0.0, 1.0), 0.0)
+        return Progress(
+            jnp.where(progress.reach < 0, now.reach, jnp.minimum(progress.reach, now.reach)),
+            jnp.maximum(progress.pinch, (as_float(now.between) + as_float(now.pinched)) / 2),
+            jnp.where(now.pinched, jnp.maximum(progress.lift, lift), progress.lift),
+            clear,
+            clear * jnp.maximum(FAR - now.away, 0.0),
         )
 
     def advance(self, goal: Any, dt: float) -> Any:
@@ -260,27 +268,29 @@ class Task(BaseTask):
         return goal._replace(touched=goal.touched + np.float32(dt))
 
     def remember(self, world: World) -> Any:
-        """Return the goal with the best so far, and how things are now."""
+        """Return the goal with the progress, and how things are now."""
         now, goal = self.now(world), world.goal
         touched = jnp.where(now.touching, goal.touched, 0.0)
-        return RetractGoal(goal.row, self.better(goal.best, now), touched, as_float(now.pinched), now.edge)
+        return RetractGoal(goal.row, self.after(goal.progress, now), touched, as_float(now.pinched), now.edge)
 
     # -- what agents get
 
     def reward_terms(self, world: World) -> dict[str, dict[str, Array]]:
         """Return the terms of every task, and the team's terms, which each agent gets.
 
-        Progress over the best of the episode so far: `reach` (m), `pinch` (1 in all), `lift` (rad), `clear`
-        (1 at `CLEAR`) and `touch` (m). Of each step: `success` and `overload`, 0 or 1 each.
+        Progress over the best of the episode so far: `reach` (m), `pinch` (1 in all) and `lift` (rad). Changes of
+        `clear` (1 at `CLEAR`) and `touch` (m), below 0 where the flap is let go or the tool draws back. Of each step:
+        `precision`, from 0 to 1, `success` and `overload`, 0 or 1 each.
         """
-        now, best, safety = self.now(world), world.goal.best, super().reward_terms(world)
-        new = self.better(best, now)
+        now, old, safety = self.now(world), world.goal.progress, super().reward_terms(world)
+        new = self.after(old, now)
         team = {
-            "reach": best.reach - new.reach,
-            "pinch": new.pinch - best.pinch,
-            "lift": new.lift - best.lift,
-            "clear": new.clear - best.clear,
-            "touch": best.touch - new.touch,
+            "reach": old.reach - new.reach,
+            "pinch": new.pinch - old.pinch,
+            "lift": new.lift - old.lift,
+            "clear": new.clear - old.clear,
+            "touch": new.touch - old.touch,
+            "precision": jnp.where(now.clear, jnp.exp(-now.away / PRECISION), 0.0),
             "success": as_float(self._done(world, now)),
             "overload": as_float(now.force > OVERLOAD),
         }
@@ -349,9 +359,9 @@ class Task(BaseTask):
         return {
             **super().terms(agent),
             f"{name}_marks": Term(marks, low, high, "object"),
-            "to_edge": Term(to_edge, *ways, "object"),
+            "to_edge": Term(to_edge, *ways, "team_goal"),  # both say where the lesion is
+            "room": Term(single("room"), 0 * one, WIDE * one, "team_goal"),
             "pinched": Term(single("pinched"), 0 * one, one, "object"),
-            "room": Term(single("room"), 0 * one, WIDE * one, "object"),
             "tissue_force": Term(single("force"), 0 * one, STRONGEST * one, "object"),
             "target": Term(target, *reach, "team_goal"),
             "to_target": Term(lambda world: target(world) - world.arms[agent].tool_tip, *ways, "team_goal"),

@@ -20,7 +20,7 @@ from surgical_marl.policies.policy import load_policy, zero_policy
 from surgical_marl.scenes.tissue_file import OVERLOAD
 from surgical_marl.tasks.base.grasp_poses import moved
 from surgical_marl.tasks.base.world import World
-from surgical_marl.tasks.tissue_retract import CLEAR, DEEP, HOLD, WRIST, Best, RetractGoal, turn_about
+from surgical_marl.tasks.tissue_retract import CLEAR, DEEP, HOLD, WRIST, Progress, RetractGoal, turn_about
 
 TASK, SCENE = "tissue_retract", "bimanual_psm_tissue"
 ROW = 7
@@ -74,9 +74,9 @@ def world(
     arms = {"psm_0": view("psm_0", first),
             "psm_1": view("psm_1", moved(task._touching(point[None], 0.0005), away)[0])}  # fmt: skip
     tissue = SimpleNamespace(position=nodes, tissue_force=np.float32(force), torn=np.bool_(False))
-    best = Best(*map(np.float32, (0.03, 0.0, 0.0, 0.0, 0.05)))  # type: ignore[arg-type]
+    none = Progress(*map(np.float32, (0.03, 0.0, 0.0, 0.0, 0.0)))  # type: ignore[arg-type]
     numbers: Any = np.float32(time), np.float32(0.0), np.zeros(3, np.float32)
-    return World(arms, RetractGoal(np.int32(ROW), best, *numbers), systems={flap.name: tissue})  # type: ignore[arg-type]
+    return World(arms, RetractGoal(np.int32(ROW), none, *numbers), systems={flap.name: tissue})  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(
@@ -132,21 +132,42 @@ def test_no_tool_gets_under_a_flap_that_hangs(difficulty: str) -> None:
         assert float(task.now(World(arms, goal, systems={"flap": tissue})).room) < CLEAR
 
 
+def paid(seen: World) -> dict[str, float]:
+    """Reward terms of the second arm, before weights."""
+    return {name: float(value) for name, value in env().task.reward_terms(seen)["psm_1"].items()}
+
+
 def test_progress_is_rewarded_once_and_only_while_the_flap_is_held() -> None:
     task: Any = env().task
-
-    def paid(seen: World) -> dict[str, float]:
-        return {name: float(value) for name, value in task.reward_terms(seen)["psm_1"].items()}
-
-    loose = paid(world(beside=0.02))
-    assert [loose[name] for name in ("pinch", "lift", "clear", "touch", "success")] == [0] * 5
+    terms = ("pinch", "lift", "clear", "touch", "precision", "success")
+    loose = world(beside=0.02)
+    assert [paid(loose)[name] for name in terms] == [0] * 6
     seen = world()
     first = paid(seen)
     assert first["pinch"] == 1 and first["clear"] == 1 and first["success"] == 1
-    assert first["lift"] == pytest.approx(2.4, abs=0.1) and first["touch"] == pytest.approx(0.05, abs=0.001)
-    again = paid(seen._replace(goal=task.remember(seen)))
+    assert first["lift"] == pytest.approx(2.4, abs=0.1) and first["touch"] == pytest.approx(0.1, abs=0.001)
+    assert first["precision"] == pytest.approx(1.0, abs=0.15)
+    held = task.remember(seen)
+    again = paid(seen._replace(goal=held))
     assert [again[name] for name in ("reach", "pinch", "lift", "clear", "touch")] == pytest.approx([0] * 5, abs=1e-6)
+    dropped = paid(loose._replace(goal=held))  # what is lost again, and what is not
+    assert [dropped["clear"], dropped["touch"]] == pytest.approx([-first["clear"], -first["touch"]])
+    assert dropped["pinch"] == dropped["lift"] == dropped["precision"] == 0
     assert paid(world(force=OVERLOAD + 1))["overload"] == 1 and first["overload"] == 0
+
+
+def test_each_step_of_the_way_to_the_lesion_pays() -> None:
+    """Also while the second tool leans towards the flap, so that it has no room yet."""
+    task: Any = env().task
+    point, seen, goals, rooms = task.tables["points"][ROW], world(), [], []
+    for share in np.linspace(1.0, 0.0, 20):
+        pose = moved(task._touching(point[None], 0.0005), share * np.array([-0.03, 0.02, 0.05]))[0]
+        pose[:3, :3] = turn_about(np.array([-1.0, 0.0, 0.0]), share) @ pose[:3, :3]
+        seen = seen._replace(arms={**seen.arms, "psm_1": view("psm_1", pose)})
+        rooms.append(float(task.now(seen).room))
+        assert all(paid(seen._replace(goal=goal))["touch"] > 0.001 for goal in goals[-1:])
+        goals.append(task.remember(seen))
+    assert rooms[0] < CLEAR < rooms[-1]
 
 
 def test_a_touch_that_is_broken_begins_anew() -> None:
@@ -155,6 +176,17 @@ def test_a_touch_that_is_broken_begins_anew() -> None:
         seen = world(away=(0.0, 0.0, off), time=0.1)
         seen = seen._replace(goal=task.advance(seen.goal, 0.02))
         assert float(task.remember(seen).touched) == pytest.approx(left, abs=1e-6)
+
+
+def test_an_arm_that_is_told_nothing_cannot_tell_where_the_lesion_is() -> None:
+    known = Env(TASK, SCENE, knowledge="one")
+    task: Any = known.task
+    seen, terms = world(HANGS), task.terms("psm_1")
+    others = [seen._replace(goal=seen.goal._replace(row=np.int32(row))) for row in range(0, 2048, 128)]
+    own = task.observes("psm_1")[5:12]  # those of the task
+    told = [len(np.unique([terms[name].read(one) for one in others], axis=0)) > 1 for name in own]
+    hidden = [name not in known.observed["psm_1"].names for name in own]
+    assert told == hidden and sum(hidden) == 4
 
 
 @pytest.mark.parametrize(("difficulty", "off"), [("easy", 0.0), ("default", 1.0), ("hard", 2.0)])
