@@ -8,7 +8,7 @@ Observation   joint positions and velocities, tool tip, position targets, contac
 Action        one number in [-1, 1] for every joint; the jaw opens above 0 and closes otherwise.
 Reward        the same for all arms, but for `clearance` and `collision`; weights in brackets. Progress over the best
               of the episode so far: `reach`, tool to needle (20 / m), `grasp` (2) and `lift` (2); while it is held
-              `align`, how far its tip, middle and tail are at most from where they should be as it enters (20 / m);
+              `align`, how far its tip, middle and tail are at most from where they should be as it enters (40 / m);
               `entry` and `exit`, exp(-error / 2 mm) where the tip went in and came out (4 each); `travel`, the share of
               the way from the entry to the end, while the entry is within the tolerance (10). Of each step: `success`
               (0.5); `force`, by how much the tissue is loaded by more than 2 N (-0.1 / N); `drop` (-2), `clearance`
@@ -147,7 +147,7 @@ class Task(Base):
         "hard": DriveLevel(2, 0.001, 0.003, True),
     }
     weights = {  # noqa: RUF012
-        "reach": 20.0, "grasp": 2.0, "lift": 2.0, "align": 20.0, "entry": 4.0, "exit": 4.0, "travel": 10.0,
+        "reach": 20.0, "grasp": 2.0, "lift": 2.0, "align": 40.0, "entry": 4.0, "exit": 4.0, "travel": 10.0,
         "success": 0.5, "force": -0.1, "drop": -2.0, "clearance": -1.0, "collision": -2.0,
     }  # fmt: skip
     default_scene = "psm_suture"
