@@ -35,14 +35,13 @@ from surgical_marl.physics.state import ATTACHMENTS, Physics
 from surgical_marl.physics.systems.arms import ArmForces, Arms, accelerations_apart, implicit_change, relaxed
 from surgical_marl.physics.systems.coupling import Coupling, Sewing
 from surgical_marl.physics.systems.rigid_bodies import RigidBodies, RigidBodyState
-from surgical_marl.physics.systems.rigid_motion import Bodies
 from surgical_marl.physics.systems.system import (
     Ends,
     Followed,
-    Load,
     Response,
     Skin,
     SkinnedSystem,
+    Springs,
     Strand,
     System,
 )
@@ -204,15 +203,20 @@ class Step:
         for name, met in meetings.items():
             own, expected = self._couplings[name], met.expected[0]
             forces = own.on_arms(forces, met.felt, met.ends, found.joints, expected, self.arms.dt)
+        # loads of other systems are long code, which is not to be in both branches
+        loaded = self._free_bodies(physics, found.slots, meetings) if meetings else ()
         near = overlap | (self._arm_of(found.slots) < self._agents).any() if self.detection.slots else overlap
+
+        def free(physics: Physics) -> tuple[Array, ...]:
+            return loaded or self._free_bodies(physics, found.slots, meetings)
 
         def coupled(physics: Physics, touch: Touch) -> tuple[Physics, Touch]:
             if not self.detection.slots:  # nothing but arms, and systems whose loads are in the forces on them
                 return self._arms_coupled(physics, touch, forces)
-            return self._all_coupled(physics, touch, forces, found, overlap, meetings)
+            return self._all_coupled(physics, touch, forces, found, overlap, *free(physics))
 
         def apart(physics: Physics, touch: Touch) -> tuple[Physics, Touch]:
-            bodies = self.step_bodies(physics.rigid_bodies, found.slots, meetings)
+            bodies = self.step_bodies(physics.rigid_bodies, found.slots, *free(physics))
             arms = self.arms.apply(physics.arms, *accelerations_apart(forces))
             overflow = jnp.maximum(touch.overflow, found.slots.total - len(found.slots.number))
             return physics.with_systems(arms=arms, rigid_bodies=bodies), touch._replace(overflow=overflow)
@@ -279,7 +283,7 @@ class Step:
         bodies, (expected, motion) = physics.rigid_bodies.bodies, self._expected(physics)
         shapes, coupling, awake = system.shapes(state), self._couplings[name], system.awake(state)
         scenery = coupling.scenery(found.poses, found.joints, bodies, motion, dt)
-        skins, loads = self._skins_of(name, physics), self._loads(name, physics, others)
+        skins, loads = self._skins_of(name, physics), self._loads(name, others)
 
         def meet() -> tuple[Ends, Response, Any]:
             if own := following.get(name):
@@ -302,16 +306,15 @@ class Step:
         """Return the skins that a system touches."""
         return [other.skin(physics.systems[at]) for at, other in self._couplings[name].skinned.items()]
 
-    def _loads(self, name: str, physics: Physics, others: dict[str, Meeting]) -> dict[str, Load]:
-        """Return the load of other systems on the skin of one as an argument of `respond`; nothing if none can be."""
+    def _loads(self, name: str, others: dict[str, Meeting]) -> dict[str, tuple[Springs, ...]]:
+        """Return the loads of other systems on the skin of one as an argument of `respond`; nothing if none can be."""
         if name not in self._skinned:
             return {}
-        nodes = len(self._skinned[name].skin(physics.systems[name]).position)
-        loads = [
-            self._couplings[other].on_skin(name, met.response, met.ends, nodes, self.arms.dt)
+        loads = tuple(
+            self._couplings[other].on_skin(name, met.response, met.ends, self.arms.dt)
             for other, met in others.items() if name in self._couplings[other].skinned
-        ]  # fmt: skip
-        return {"load": Load.sum(loads)} if loads else {}
+        )  # fmt: skip
+        return {"loads": loads} if loads else {}
 
     def _systems_moved(
         self, before: Physics, after: Physics, found: Found, meetings: dict[str, Meeting]
@@ -353,7 +356,7 @@ class Step:
 
     def _all_coupled(
         self, physics: Physics, touch: Touch, forces: ArmForces, found: Found, overlap: Array,
-        meetings: dict[str, Meeting],
+        masses: Array, free: Array, awake: Array,
     ) -> tuple[Physics, Touch]:  # fmt: skip
         """Step all arms and bodies together.
 
@@ -362,7 +365,6 @@ class Step:
         dt, slots, (bodies, grips) = self.arms.dt, found.slots, physics.rigid_bodies
         model = ContactModel(self._rigid.tables, self._solver.twists)
         felt = model.feel(slots, found.joints, found.fingers, physics.qvel, bodies, grips, dt)
-        masses, free, awake = self._free_bodies(bodies, slots, meetings, self._attached(physics))
         contacts, rows = felt.contacts, None
         if self.attachments:
             rows = self.attachments.rows(
@@ -390,9 +392,10 @@ class Step:
         return physics.with_systems(arms=arms, rigid_bodies=RigidBodyState(after, grips)), touch
 
     def _free_bodies(
-        self, bodies: Bodies, slots: Slots, meetings: dict[str, Meeting], attached: Array | bool = False
+        self, physics: Physics, slots: Slots, meetings: dict[str, Meeting]
     ) -> tuple[Array, Array, Array]:  # fmt: skip
         """Return mass matrices and accelerations of bodies without contacts, with loads, and which are awake."""
+        bodies, attached = physics.rigid_bodies.bodies, self._attached(physics)
         awake = slots.awake if attached is False else slots.awake | attached
         masses, free = self._rigid.free_motion(bodies, awake)
         for name, met in meetings.items():
@@ -409,13 +412,20 @@ class Step:
         return (active[:, None] & (self.attachments.bodies[:, None] == np.arange(len(self._rigid.names)))).any(0)
 
     def step_bodies(
-        self, state: RigidBodyState, slots: Slots, meetings: dict[str, Meeting] | None = None
+        self, state: RigidBodyState, slots: Slots, masses: Array, free: Array, awake: Array
     ) -> RigidBodyState:  # fmt: skip
-        """Return the bodies after a step in which no arm is near."""
+        """Return the bodies after a step in which no arm is near.
+
+        Args:
+            state: of the bodies.
+            slots: where they touch.
+            masses: mass matrices of the bodies, with loads, [k, 6, 6].
+            free: accelerations of the bodies without contacts, [k, 6].
+            awake: which of them do not sleep, [k] bool.
+        """
         if not self._rigid.names:
             return state
         bodies, grips = state
-        masses, free, awake = self._free_bodies(bodies, slots, meetings or {})
         model = ContactModel(self._rigid.tables, self._solver_of_bodies.twists)
         felt = model.feel(slots, None, None, jnp.zeros(0), bodies, grips, self.arms.dt)
         found = self._solve_bodies(masses, free, felt.contacts, slots, awake)

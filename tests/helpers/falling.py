@@ -68,8 +68,9 @@ class Falling:
 
     def _advance(self, objects: RigidBodyState, gravity: Any, slow: Any, steps: int) -> tuple[RigidBodyState, Trace]:
         def step(objects: RigidBodyState, _: None) -> tuple[RigidBodyState, Trace]:
-            slots = self.step.slots(self._arms.with_systems(rigid_bodies=objects))
-            objects = self.step.step_bodies(objects, slots)
+            physics = self._arms.with_systems(rigid_bodies=objects)
+            slots = self.step.slots(physics)
+            objects = self.step.step_bodies(objects, slots, *self.step._free_bodies(physics, slots, {}))
             bodies, depth = objects.bodies, self.depth(objects)
             return objects, Trace(bodies.position, bodies.quaternion, bodies.velocity, depth)
 

@@ -14,7 +14,8 @@ import yaml
 
 import surgical_marl as sm
 from surgical_marl.physics.simulator import Simulator
-from surgical_marl.physics.systems.system import Load
+from surgical_marl.physics.solver.cholesky import FULL
+from surgical_marl.physics.systems.system import Springs
 from surgical_marl.robots.rotation import quaternion
 
 DT, CHUNK = 2.5e-3, 100
@@ -39,6 +40,19 @@ class Seen(NamedTuple):
     channels: Any
     left_out: Any
     """Contacts that found no room, [t]."""
+
+
+def pulling(force: Any) -> Springs:
+    """Return springs that do nothing but pull nodes with a force [n, 3], N."""
+    n = len(force)
+    nodes, weights = jnp.repeat(jnp.arange(n)[:, None], 4, 1), jnp.tile(jnp.array([1.0, 0.0, 0.0, 0.0]), (n, 1))
+    return Springs(nodes, weights, force, jnp.zeros((n, 6)), jnp.int32(n))
+
+
+def pulled(load: Springs, u: Any) -> Any:
+    """Return the force of springs at displacements of the nodes, m, [n, 3]: N, [3]."""
+    moved = jnp.einsum("cq,cqi->ci", load.weights, u[load.nodes])
+    return (load.force - jnp.einsum("cij,cj->ci", load.stiffness[:, FULL], moved)).sum(0)
 
 
 class Bench:
@@ -97,19 +111,19 @@ class Bench:
         inner, step = physics.rigid_bodies, copy.copy(self.step)
         loads = step._loads
 
-        def pulled(*args: Any) -> dict[str, Load]:
-            return {name: load._replace(force=load.force + pull) for name, load in loads(*args).items()}
+        def with_pull(name: str, others: Any) -> dict[str, tuple[Springs, ...]]:
+            return {key: (*own, pulling(pull)) for key, own in loads(name, others).items()}
 
-        step._loads = pulled
+        step._loads = with_pull
         bodies = inner.bodies._replace(
             position=position, quaternion=turn, velocity=velocity, acceleration=jnp.zeros_like(velocity)
         )
         tissue, physics = physics.systems["sheet"], physics.with_systems(rigid_bodies=inner._replace(bodies=bodies))
         found = step.find(physics, step.arms.dynamics.pose(physics.qpos))
         meetings = step._meetings(physics, found)
-        load = loads("sheet", physics, meetings)["load"]
+        (load,) = loads("sheet", meetings)["loads"]
         after = step._systems_moved(physics, physics, found, meetings)
         chain, state = after.systems["thread"].chain, after.systems["sheet"]
-        force = (load.force - load.falls(state.nodes.position - tissue.nodes.position)).sum(0)
+        force = pulled(load, state.nodes.position - tissue.nodes.position)
         view, left_out = self.tissue.view(state).channels, meetings["thread"].ends.left_out
         return after, Seen(chain.tension[:-1], chain.position, state.nodes.position, force, view, left_out)

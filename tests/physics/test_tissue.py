@@ -18,7 +18,8 @@ from scipy.sparse.linalg import eigsh, spsolve
 from docs.studies.tissue_mesh import PATCH, PRESS, REFERENCE, SIZE
 from surgical_marl.physics.systems.brick import CORNERS, Brick, polar_rotation, stiffness
 from surgical_marl.physics.systems.brick_grid import BrickGrid
-from surgical_marl.physics.systems.brick_solve import BrickSolver, Nodes, Springs, Support
+from surgical_marl.physics.systems.brick_solve import BrickSolver, Nodes, Support
+from surgical_marl.physics.systems.system import Springs
 from tests.helpers.fused_kernels import run
 
 YOUNG, POISSON, DENSITY = 27040.0, 0.4287, 1000.0
@@ -48,7 +49,7 @@ def pushed(solver: BrickSolver, force: np.ndarray) -> Springs:
     return Springs(*map(jnp.asarray, parts), jnp.int32(len(nodes)))
 
 
-def settled(solver: BrickSolver, springs: Springs | None = None, dt: float = 0.05, steps: int = 12) -> np.ndarray:
+def settled(solver: BrickSolver, *springs: Springs, dt: float = 0.05, steps: int = 12) -> np.ndarray:
     """Displacements at rest, m, [n, 3], after long implicit steps."""
     start = Nodes(jnp.asarray(solver.grid.rest), jnp.zeros((solver.grid.nodes, 3)))
     step = jax.jit(lambda now: jax.lax.fori_loop(0, steps, lambda _, now: solver.step(now, dt, springs), now))

@@ -14,8 +14,9 @@ import pytest
 
 from surgical_marl.engines.fused import kernel
 from surgical_marl.envs.batch import BatchedEnv
+from surgical_marl.physics.solver.cholesky import LOWER
 from surgical_marl.physics.systems.brick_solve import Nodes
-from surgical_marl.physics.systems.system import End, Ends
+from surgical_marl.physics.systems.system import End, Ends, Springs
 from surgical_marl.physics.systems.tissue import Tissue
 from surgical_marl.physics.systems.tissue_step import Held, TissueStep
 from tests.helpers.block_kernels import DEVICES, cuda_of, run_block
@@ -64,6 +65,21 @@ def touched(tissue: Tissue, contacts: int, q: int = 4) -> tuple[Held, Ends]:
     return held, Ends(rows, jnp.int32(max(contacts - 2, 0)), jnp.int32(contacts), jnp.int32(0))
 
 
+def borne(tissue: Tissue, springs: int) -> tuple[Springs, ...]:
+    """Loads of two systems, of which the first has so many springs, and the second one less."""
+    if not springs:
+        return ()
+    rng, loads = np.random.default_rng(5), []
+    for used in (springs, springs - 1):
+        nodes, room = rng.choice(np.flatnonzero(tissue.grid.mass), (springs, 4)), (springs, 3)
+        factor = rng.normal(size=(springs, 3, 3))
+        weights, stiff = rng.dirichlet(np.ones(4), springs), 300 * np.einsum("cij,ckj->cik", factor, factor)
+        parts = weights, 0.05 * rng.normal(size=room), stiff[:, *LOWER]
+        real = (jnp.asarray(part, jnp.float32) for part in parts)
+        loads.append(Springs(jnp.asarray(nodes, jnp.int32), *real, jnp.int32(used)))
+    return tuple(loads)
+
+
 def close(found: dict[str, np.ndarray], expected: Any, contacts: int, share: float) -> None:
     for name, values in expected._asdict().items():
         own, scale = found[name], np.abs(values).max(initial=1e-12)
@@ -74,15 +90,16 @@ def close(found: dict[str, np.ndarray], expected: Any, contacts: int, share: flo
 
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize(
-    ("sheet", "contacts", "q"),
-    [("sheet", CONTACTS, 4), ("sheet", 0, 4), ("holes", CONTACTS, 8), ("loose", CONTACTS, 4)],
+    ("sheet", "contacts", "q", "springs"),
+    [("sheet", CONTACTS, 4, 0), ("sheet", 0, 4, 0), ("holes", CONTACTS, 8, 6), ("loose", CONTACTS, 4, 3)],
 )
-def test_cuda_code_computes_what_jax_does(sheet: str, contacts: int, q: int, device: str) -> None:
+def test_cuda_code_computes_what_jax_does(sheet: str, contacts: int, q: int, springs: int, device: str) -> None:
     tissue = SHEETS[sheet]
     (step, respond, move), nodes, (held, ends) = step_of(sheet), shaken(tissue, 4e-4), touched(tissue, contacts, q)
-    expected = respond(nodes, held, ends)
+    loads = borne(tissue, springs)
+    expected = respond(nodes, held, ends, loads)
     assert contacts == 0 or (np.abs(expected.force[:contacts]).max(1) > 0).sum() >= 4
-    close(run_block(device, step.respond, nodes, held, ends), expected, contacts, 5e-5)
+    close(run_block(device, step.respond, nodes, held, ends, loads), expected, contacts, 5e-5)
     pushed = jnp.asarray(
         np.random.default_rng(2).normal(size=(ROOM, 3)) * (np.arange(ROOM) < contacts)[:, None], jnp.float32
     )

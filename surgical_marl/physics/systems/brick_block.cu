@@ -73,7 +73,7 @@ struct Block {
     }
     static __device__ float mean(const float *lower) { return (lower[0] + lower[2] + lower[5]) / 3; }
     // The place of a point on nodes, times its shares.
-    static __device__ void point(const float *x, const int *nodes, const float *weights, float *found) {
+    static __device__ void point(const float *x, const short *nodes, const float *weights, float *found) {
         for (int i = 0; i < 3; i++) found[i] = 0.0f;
         for (int k = 0; k < HELD; k++)
             for (int i = 0; i < 3; i++) found[i] += weights[k] * x[3 * nodes[k] + i];
@@ -82,7 +82,7 @@ struct Block {
 
 // Which contacts hang on each node: a chain of numbers HELD * row + k for each, that ends with -1.
 struct Hung {
-    static __device__ void link(const int *nodes, const float *weights, int rows, int node, short *first, short *next) {
+    static __device__ void link(const short *nodes, const float *weights, int rows, int node, short *first, short *next) {
         int last = -1;
         first[node] = -1;
         for (int k = 0; k < HELD * rows; k++)

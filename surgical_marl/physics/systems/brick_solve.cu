@@ -2,19 +2,21 @@
 // A thread keeps its bricks, and of its nodes all but p. Contacts are springs at points of the tissue.
 __shared__ float p[3 * NODES], each[PAD * BRICKS], block[6 * NODES], box[2][64], rigid[28];
 __shared__ float stiffness[6 * ROOM], pull[3 * ROOM], weights[HELD * ROOM];
-__shared__ int nodes[HELD * ROOM];
-__shared__ short first[NODES], next[HELD * ROOM];
+__shared__ short nodes[HELD * ROOM], first[NODES], next[HELD * ROOM];
 const float stiffer = in.stiffer[0], blend = stiffer * BLEND;
 Brick brick[BRICKS_EACH];
 int corner[BRICKS_EACH];
 float u[NODES_EACH][3], residual[NODES_EACH][3], inertia[NODES_EACH], free[NODES_EACH];
 float inverse[NODES_EACH][6], upright[NODES_EACH][9];
 
-// The nodes of the contacts, and of each node the contacts.
-const auto hang = [&](int rows) {
-    for (int k = thread; k < HELD * rows; k += threads) nodes[k] = in.held_nodes[k], weights[k] = in.held_weights[k];
+// The nodes of the contacts.
+const auto hold = [&](int rows) {
+    for (int k = thread; k < HELD * rows; k += threads) nodes[k] = (short)in.held_nodes[k], weights[k] = in.held_weights[k];
+};
+// Of each node the springs that hang on it.
+const auto hang = [&](int springs) {
     __syncthreads();
-    EACH_NODE(a, n) Hung::link(nodes, weights, rows, n, first, next);
+    EACH_NODE(a, n) Hung::link(nodes, weights, springs, n, first, next);
 };
 const auto add_pulls = [&](int n, float *sum) {
     for (int k = first[n]; k >= 0; k = next[k])

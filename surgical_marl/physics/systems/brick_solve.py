@@ -12,7 +12,7 @@ a loop over bricks. Loops over bricks and nodes are scans, since the fused engin
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -24,6 +24,7 @@ from surgical_marl.physics.solver.cholesky import FULL, LOWER, cholesky, solve_f
 from surgical_marl.physics.systems.brick import Brick, Cell, inverse_symmetric, to_modes
 from surgical_marl.physics.systems.brick_grid import BrickGrid
 from surgical_marl.physics.systems.rigid_motion import point_jacobian
+from surgical_marl.physics.systems.system import Springs
 
 LEFT, SHORTEST = 0.4, 1 / 16
 """Share of its volume that a brick keeps in a step at least, and the shortest part of a step that is tried for this."""
@@ -47,21 +48,6 @@ class Support(NamedTuple):
     """Of a spring to the place at rest, N/m; 0 for none."""
     rest: np.ndarray
     """The places at rest, m, [n, 3]."""
-
-
-class Springs(NamedTuple):
-    """Linear springs at c points of the tissue, of which the first `used` are there."""
-
-    nodes: Array
-    """On which each point hangs, [c, 4]."""
-    weights: Array
-    """Shares of these nodes, [c, 4]."""
-    force: Array
-    """On the point without displacement, N, [c, 3]."""
-    stiffness: Array
-    """By how much it falls as the point moves, N/m, lower half, [c, 6]."""
-    used: Array
-    """[]"""
 
 
 class Linear(NamedTuple):
@@ -177,7 +163,7 @@ class BrickSolver:
         x, y, z = np.diag(gives) * np.diag(matrix)[place].mean()
         return min(x, y), z
 
-    def displacements(self, linear: Linear, springs: Springs | None, guess: Array, dt: Any) -> Array:
+    def displacements(self, linear: Linear, springs: Sequence[Springs], guess: Array, dt: Any) -> Array:
         """Return the displacements of the nodes in a step, m, [n, 3], from a guess that leaves what is fixed."""
         return self.improved(linear, springs, guess, self.residual(linear, guess, dt), dt, self.iterations)[0]
 
@@ -189,32 +175,27 @@ class BrickSolver:
         return found
 
     def improved(
-        self, linear: Linear, springs: Springs | None, u: Array, residual: Array, dt: Any, most: Any,
-        enough: float = 0.0, falls: Callable[[Array], Array] | None = None,
+        self, linear: Linear, springs: Sequence[Springs], u: Array, residual: Array, dt: Any, most: Any,
+        enough: float = 0.0,
     ) -> tuple[Array, Array]:  # fmt: skip
         """Return better displacements, m, [n, 3], and the forces that these leave without springs, N, [n, 3].
 
         Args:
             linear: the step's equations.
-            springs: at points of the tissue.
+            springs: at points of the tissue, in lists.
             u: displacements that leave what is fixed.
             residual: the forces that these leave without springs.
             dt: duration of the step, s.
             most: most conjugate gradients.
             enough: residual at which they stop, in the norm of the inverse of the nodes' own blocks, J.
-            falls: takes displacements, m, returns by how much other forces fall with these, N, [n, 3].
         """
-        free, block = jnp.asarray(self.free), linear.block
-        if springs is not None:
-            residual, block = _pushed(springs, u, residual), _stiffened(springs, block)
+        free = jnp.asarray(self.free)
+        residual, block = _pushed(springs, u, residual), _stiffened(springs, linear.block)
         none, factors = jnp.zeros(3), (_factorised(block, linear.upright), linear.upright)
 
         def matrix(p: Array, sums: Array) -> Array:
             """Return the matrix times p, [n, 3], in the rows of `sums`, which hold inertia times p."""
-            sums = self._elastic(linear.cells, p, sums, dt)
-            if falls is not None:
-                sums += falls(p)
-            return sums if springs is None else _springs_times(springs, p, sums)
+            return _springs_times(springs, p, self._elastic(linear.cells, p, sums, dt))
 
         def up(found: tuple[Array, Array], residual: Array, factor: Any) -> tuple[tuple[Array, Array], Array]:
             """Go up a column by one node, and add its part of the norm of the residual."""
@@ -273,9 +254,9 @@ class BrickSolver:
 
         start = jnp.int32(0), u, residual, p, ap, rz
         _, u, residual, *_ = jax.lax.while_loop(goes_on, iterate, start)
-        return u, residual if springs is None else _pushed(springs, u, residual, -1.0)
+        return u, _pushed(springs, u, residual, -1.0)
 
-    def unbalanced(self, state: Nodes, linear: Linear, springs: Springs, u: Array, dt: Any) -> Array:
+    def unbalanced(self, state: Nodes, linear: Linear, springs: Sequence[Springs], u: Array, dt: Any) -> Array:
         """Return the forces of all but bricks that inertia does not balance after displacements u, N, [n, 3]."""
 
         def one(row: Any) -> Array:
@@ -286,7 +267,7 @@ class BrickSolver:
         rows = mass, support, *state, jnp.asarray(self.support.rest), u, linear.inertia
         return _pushed(springs, u, jax.lax.map(one, rows))
 
-    def balanced(self, position: Array, left: Array, inertia: Array, springs: Springs | None = None) -> Array:
+    def balanced(self, position: Array, left: Array, inertia: Array, springs: Sequence[Springs] = ()) -> Array:
         """Return a rigid motion of all nodes, m, [n, 3], by which forces that are left have no sum and no torque.
 
         Forces of bricks have neither, whatever gradients leave. So linear and angular momentum are right.
@@ -305,14 +286,12 @@ class BrickSolver:
             return (sums[0] + inertia * (moves.T @ moves), sums[1] + moves.T @ left), None
 
         sums, _ = jax.lax.scan(add, (jnp.zeros((6, 6)), jnp.zeros(6)), (position, left, inertia))
-        if springs is not None:
 
-            def stiffen(own: Any, matrix: Array) -> Array:
-                moves = point_jacobian(own.weights @ position[own.nodes] - centre)  # weights sum to 1
-                return matrix + moves.T @ own.stiffness[FULL] @ moves
+        def stiffen(own: Any, matrix: Array) -> Array:
+            moves = point_jacobian(own.weights @ position[own.nodes] - centre)  # weights sum to 1
+            return matrix + moves.T @ own.stiffness[FULL] @ moves
 
-            sums = _each(springs, stiffen, sums[0]), sums[1]
-        motion = solve_factored(cholesky(sums[0]), sums[1])
+        motion = solve_factored(cholesky(_each(springs, stiffen, sums[0])), sums[1])
         rows = position, jnp.asarray(self.free)
         found: Array = jax.lax.map(lambda row: row[1] * (point_jacobian(row[0] - centre) @ motion), rows)
         return found
@@ -339,7 +318,7 @@ class BrickSolver:
         found: Nodes = jax.lax.map(lambda row: Nodes(row[0] + row[1], row[1] / dt), (state.position, u))
         return found
 
-    def step(self, state: Nodes, dt: Any, springs: Springs | None = None) -> Nodes:
+    def step(self, state: Nodes, dt: Any, springs: Sequence[Springs] = ()) -> Nodes:
         """Return the state after a step in which nothing but its supports, its weight and springs act."""
         linear = self.linearise(state, dt)
         return self.moved(state, self.displacements(linear, springs, linear.guess, dt), dt)
@@ -397,14 +376,18 @@ def _factorised(block: Array, upright: Array) -> Array:
     return found
 
 
-def _each(springs: Springs, of: Callable[[Any, Any], Any], start: Any) -> Any:
-    def add(row: Array, sums: Any) -> Any:
-        return of(jax.tree.map(lambda x: x[row], springs._replace(used=springs.force)), sums)
+def _each(springs: Sequence[Springs], of: Callable[[Any, Any], Any], start: Any) -> Any:
+    for some in springs:
+        rows = some._replace(used=some.force)
 
-    return jax.lax.fori_loop(0, springs.used, add, start)
+        def add(row: Array, sums: Any, rows: Springs = rows) -> Any:
+            return of(jax.tree.map(lambda x: x[row], rows), sums)
+
+        start = jax.lax.fori_loop(0, some.used, add, start)
+    return start
 
 
-def _pushed(springs: Springs, u: Array, forces: Array, share: float = 1.0) -> Array:
+def _pushed(springs: Sequence[Springs], u: Array, forces: Array, share: float = 1.0) -> Array:
     """Return forces on nodes, N, [n, 3], with a share of those of springs at displacements u, m, [n, 3]."""
 
     def add(own: Any, forces: Array) -> Array:
@@ -417,7 +400,7 @@ def _pushed(springs: Springs, u: Array, forces: Array, share: float = 1.0) -> Ar
     return found
 
 
-def _stiffened(springs: Springs, block: Array) -> Array:
+def _stiffened(springs: Sequence[Springs], block: Array) -> Array:
     def add(own: Any, block: Array) -> Array:
         for node, weight in zip(own.nodes, own.weights, strict=True):
             block = block.at[node].add(weight * weight * own.stiffness, mode="promise_in_bounds")
@@ -427,7 +410,7 @@ def _stiffened(springs: Springs, block: Array) -> Array:
     return found
 
 
-def _springs_times(springs: Springs, p: Array, out: Array) -> Array:
+def _springs_times(springs: Sequence[Springs], p: Array, out: Array) -> Array:
     def add(own: Any, out: Array) -> Array:
         moved = own.weights @ p[own.nodes]
         force = own.stiffness[FULL] @ moved

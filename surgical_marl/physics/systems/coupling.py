@@ -22,19 +22,19 @@ from surgical_marl.physics.contact.part_detection import NOWHERE, PartDetection,
 from surgical_marl.physics.contact.shapes import Plate, Segments
 from surgical_marl.physics.contact.skin_detection import add_skin_contacts, near_skin
 from surgical_marl.physics.contact.spring_contact import each
-from surgical_marl.physics.solver.cholesky import FULL, cholesky, solve_factored
+from surgical_marl.physics.solver.cholesky import FULL, LOWER, cholesky, solve_factored
 from surgical_marl.physics.systems.arms import ArmForces
 from surgical_marl.physics.systems.rigid_motion import Bodies, point_jacobian, rotation
 from surgical_marl.physics.systems.system import (
     End,
     Ends,
     Followed,
-    Load,
     Response,
     Shapes,
     Skin,
     SkinnedSystem,
     Spot,
+    Springs,
     System,
     Tie,
 )
@@ -322,33 +322,44 @@ class Coupling:
         found: tuple[Array, Array, Array] = jax.lax.map(of_body, (jnp.arange(k), masses, free, bodies))
         return found
 
-    def on_skin(self, name: str, response: Response, ends: Ends, nodes: int, dt: Any) -> Load:
-        """Return the forces on the n nodes of a skin, and by how much these fall as the nodes move."""
+    def on_skin(self, name: str, response: Response, ends: Ends, dt: Any) -> Springs:
+        """Return the forces of contacts on a skin, and by how much each falls as its point of the skin moves.
+
+        The force on a point also depends on the motion of others, through the system that touches the skin. That part
+        is reckoned with for the motion that is expected, and for all motion by the response after the skin's own.
+        """
         number = [*self.skinned].index(name)
+        alone = response.falls if response.falls is not None else response.alone
+        if alone is None:
+            alone = self._alone(response, ends, dt)
 
-        def spread(forces: Array) -> Array:
-            def add(row: Array, sums: Array) -> Array:
-                spot = _spot(row_of(ends.rows, row), number)
-                for node, weight in zip(spot.nodes, spot.weights, strict=True):
-                    sums = sums.at[node].add(weight * forces[row], mode="promise_in_bounds")
-                return sums
+        def spring(row: Array, end: End) -> tuple[Any, ...]:
+            spot, mine, falls = _spot(end, number), end.shape == -1 - number, alone[row]
+            force = response.force[row] + falls[FULL] @ end.shift
+            return *spot, jnp.where(mine, force, 0.0), jnp.where(mine, falls, 0.0)
 
-            found: Array = jax.lax.fori_loop(0, ends.moving, add, jnp.zeros((nodes, 3)))
-            return found
+        def last(row: Array, found: Array) -> Array:
+            return jnp.where(row_of(ends.rows, row).shape == -1 - number, row + 1, found)
 
-        def fallen(moved: Callable[[End], Array]) -> Array:
-            accelerations = each(ends, lambda row, end: moved(end) / (dt * dt), moving=True)
-            return self._system.yielding(response, ends, accelerations, dt)
+        used = jax.lax.fori_loop(0, ends.moving, last, jnp.int32(0))
+        nodes, weights, force, stiffness = each(ends._replace(moving=used), spring, moving=True)
+        return Springs(nodes, weights, force, stiffness, used)
 
-        def unmoved() -> Array:
-            return spread(response.force + fallen(lambda end: jnp.where(end.shape == -1 - number, end.shift, 0.0)))
+    def _alone(self, response: Response, ends: Ends, dt: Any) -> Array:
+        """Return by how much the force on each end falls as that end alone moves, N/m: lower halves, [c, 6]."""
 
-        def falls(u: Array) -> Array:
-            return spread(fallen(lambda end: _mean(_spot(end, number), u)))
+        def fall(row: Array, end: End) -> Array:
+            del end
 
-        touched = self._on_skins_now(ends)
-        force = jax.lax.cond(touched, unmoved, lambda: jnp.zeros((nodes, 3)))
-        return Load(force, lambda u: jax.lax.cond(touched, falls, jnp.zeros_like, u), touched)
+            def along(axis: Array) -> Array:
+                accelerations = jnp.zeros_like(response.force).at[row].set(axis / (dt * dt))
+                return self._system.yielding(response, ends, accelerations, dt)[row]
+
+            found: Array = jax.lax.map(along, jnp.eye(3))
+            return found[LOWER]
+
+        found: Array = each(ends, fall, moving=True)
+        return found
 
     def after_skins(self, response: Response, ends: Ends, moved: Sequence[Array], dt: Any) -> Response:
         """Return the response with its forces as the nodes of each skin move by this much, m, [n, 3]."""

@@ -13,8 +13,6 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from functools import reduce
-from operator import add, or_
 from typing import Any, ClassVar, NamedTuple
 
 import jax.numpy as jnp
@@ -194,6 +192,9 @@ class Response(NamedTuple):
     falls: Array | None = None
     """By how much the force on each end falls as that end moves, N/m: lower halves, [c, 6]. None if the motion of one
     end changes the forces on others, as `yielding` says then."""
+    alone: Array | None = None
+    """In that case, by how much the force on each end falls as that end alone moves: the blocks on the diagonal of what
+    `yielding` multiplies by. None if they are to be found by `yielding`. Only those of skins count."""
 
 
 class Skin(NamedTuple):
@@ -205,23 +206,19 @@ class Skin(NamedTuple):
     """m/s, [n, 3]"""
 
 
-class Load(NamedTuple):
-    """Forces of other systems on the nodes of one, linear in the displacements of these in the step."""
+class Springs(NamedTuple):
+    """Linear springs at c points of a system with a skin, of which the first `used` are there."""
 
+    nodes: Array
+    """On which each point hangs, [c, q]."""
+    weights: Array
+    """Shares of these nodes, [c, q]."""
     force: Array
-    """Without displacement, N, [n, 3]."""
-    falls: Callable[[Array], Array]
-    """Takes displacements, m, [n, 3], returns by how much the forces fall, N, [n, 3]: symmetric and positive
-    semidefinite, with the unknowns of the other systems eliminated."""
-    touching: Array
-    """True if there is any, [] bool."""
-
-    @classmethod
-    def sum(cls, loads: Sequence[Load]) -> Load:
-        """Return all of some loads as one."""
-        force = reduce(add, [load.force for load in loads])
-        touching = reduce(or_, [load.touching for load in loads])
-        return cls(force, lambda u: reduce(add, [load.falls(u) for load in loads]), touching)
+    """On the point without displacement, N, [c, 3]."""
+    stiffness: Array
+    """By how much it falls as the point moves, N/m, lower half, [c, 6]; symmetric, positive semidefinite."""
+    used: Array
+    """[]"""
 
 
 class Bars(NamedTuple):
@@ -359,8 +356,16 @@ class SkinnedSystem(System):
         return ends
 
     @abstractmethod
-    def respond(self, state: Any, motion: Any, ends: Ends, dt: Any, load: Load | None = None) -> Response:
-        """Return the forces on the ends of its own contacts, as it bears a load, if any other system can touch it."""
+    def respond(self, state: Any, motion: Any, ends: Ends, dt: Any, loads: Sequence[Springs] = ()) -> Response:
+        """Return the forces on the ends of its own contacts, as it bears the loads of others: of each that touches it.
+
+        Args:
+            state: of the system.
+            motion: its `free_motion`.
+            ends: of its own contacts.
+            dt: duration of a step, s.
+            loads: forces at the other systems' contacts with the skin.
+        """
 
     @abstractmethod
     def displacements(self, response: Response) -> Array:

@@ -7,7 +7,7 @@ world.systems["tissue"].tissue_force             # N, of the hardest touch
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, ClassVar, NamedTuple
@@ -32,11 +32,11 @@ from surgical_marl.physics.systems.system import (
     End,
     Ends,
     Followed,
-    Load,
     Response,
     Shapes,
     Skin,
     SkinnedSystem,
+    Springs,
 )
 from surgical_marl.physics.systems.tissue_step import Answer, Held, TissueStep
 from surgical_marl.physics.tree_utils import row_of
@@ -265,10 +265,10 @@ class Tissue(Soft, SkinnedSystem):
         """Return nothing: one stage has all forces."""
         return ()
 
-    def respond(self, state: TissueState, motion: Any, ends: Ends, dt: Any, load: Load | None = None) -> Response:
+    def respond(self, state: TissueState, motion: Any, ends: Ends, dt: Any, loads: Sequence[Springs] = ()) -> Response:
         ends = ends if self.channels else self.rubbed(ends)
         ends, held = recall(state.stretches, ends, len(self.points.nodes)), self._held(state, ends)
-        answer = self._step(dt).respond(state.nodes, held, ends, load)
+        answer = self._step(dt).respond(state.nodes, held, ends, loads)
         return Response(-answer.force, Solved(answer, held, ends), falls=answer.falls)
 
     def displacements(self, response: Response) -> Array:

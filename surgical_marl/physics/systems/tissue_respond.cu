@@ -51,7 +51,31 @@ const auto contact = [&](int c) {
 };
 const int rows = in.ends_total[0], moving = in.ends_moving[0];
 
-hang(rows);
+// Springs of other systems on the skin come after the contacts.
+int springs = rows;
+const auto bear = [&](const auto &points, const auto &shares, const auto &pushes, const auto &falls, int used) {
+    const int held = points.size * 3 / pushes.size;
+    for (int k = thread; k < HELD * used; k += threads) {
+        const int c = k / HELD, own = k % HELD;
+        nodes[HELD * springs + k] = own < held ? (short)points[held * c + own] : 0;
+        weights[HELD * springs + k] = own < held ? shares[held * c + own] : 0.0f;
+    }
+    for (int k = thread; k < 6 * used; k += threads) stiffness[6 * springs + k] = falls[k];
+    for (int k = thread; k < 3 * used; k += threads) force[3 * springs + k] = pushes[k];
+    springs += used;
+};
+hold(rows);
+BEAR_LOADS
+hang(springs);
+// What springs of others pull at displacements p, and what contacts do.
+const auto pulls = [&](int begin) {
+    for (int c = begin + thread; c < springs; c += threads) {
+        float moved[3], falls[3];
+        Block::point(p, nodes + HELD * c, weights + HELD * c, moved);
+        Symmetric::times(stiffness + 6 * c, moved, falls);
+        for (int i = 0; i < 3; i++) pull[3 * c + i] = force[3 * c + i] - falls[i];
+    }
+};
 linearise();
 // forces of all but bricks, without contacts, that inertia does not balance at displacements u
 const auto unbalanced = [&](int a, int n, float *found) {
@@ -78,7 +102,8 @@ EACH_NODE(a, n) {
     for (int i = 0; i < 3; i++) residual[a][i] -= falls[i];
 }
 
-const int rounds = rows > 0 ? ROUNDS : 1, iterations = rows > 0 ? TURNS : ALONE;
+const int rounds = springs > 0 ? ROUNDS : 1, iterations = springs > 0 ? TURNS : ALONE;
+pulls(rows);
 for (int round = 0; round < rounds; round++) {
     // contacts anew: by how much their forces differ from those in the residual
     for (int c = thread; c < rows; c += threads) {
@@ -98,22 +123,18 @@ for (int round = 0; round < rounds; round++) {
     }
     __syncthreads();
     EACH_NODE(a, n) add_pulls(n, residual[a]);
-    improve(rows, iterations, ENOUGH);
+    improve(springs, iterations, ENOUGH);
+    for (int k = 3 * rows + thread; k < 3 * springs; k += threads) pull[k] = 0.0f;  // in the residual from now on
 }
 if (LOOSE) {
     float left[NODES_EACH][3];
-    for (int c = thread; c < rows; c += threads) {
-        float moved[3], felt[3];
-        Block::point(p, nodes + HELD * c, weights + HELD * c, moved);
-        Symmetric::times(stiffness + 6 * c, moved, felt);
-        for (int i = 0; i < 3; i++) pull[3 * c + i] = force[3 * c + i] - felt[i];
-    }
+    pulls(0);
     __syncthreads();
     EACH_NODE(a, n) {
         unbalanced(a, n, left[a]);
         add_pulls(n, left[a]);
     }
-    balance(left, rows);
+    balance(left, springs);
 }
 
 shorten();

@@ -9,7 +9,7 @@ an element, `brick_solve.cu` for conjugate gradients, and `brick_block.cu` for w
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
@@ -23,9 +23,9 @@ from surgical_marl.engines.stages import MOST_SHARED, block_stage
 from surgical_marl.physics.contact.spring_contact import each, feel
 from surgical_marl.physics.solver.cholesky import FULL, LOWER
 from surgical_marl.physics.systems.brick import CRUSHED, EVENED, ITERATIONS, RESISTANCE
-from surgical_marl.physics.systems.brick_solve import LEFT, SHORTEST, BrickSolver, Nodes, Springs
+from surgical_marl.physics.systems.brick_solve import LEFT, SHORTEST, BrickSolver, Nodes
 from surgical_marl.physics.systems.channel import Channels
-from surgical_marl.physics.systems.system import End, Ends, Load
+from surgical_marl.physics.systems.system import End, Ends, Springs
 from surgical_marl.physics.tree_utils import put, row_of
 
 ROUNDS, TURNS = 4, 3
@@ -111,15 +111,10 @@ class TissueStep:
         self.solver, self.tears, self.dt, self.channels = solver, tears, dt, channels
         self.feel = channels.feel if channels else feel
 
-    def respond(self, nodes: Nodes, held: Held, ends: Ends, load: Load | None = None) -> Answer:
-        """Return the displacements of nodes whose contacts' ends move as expected, and the forces on these.
-
-        The load of other systems is no array that a kernel could read: with it the reference runs on a GPU too.
-        """
-        if load:
-            return self.answered(nodes, held, ends, self.solver.stiffer, self.mesh, load)
-        stage = self._stage("respond", self.answered, held)
-        return stage(nodes, held, ends, jnp.float32(self.solver.stiffer), self.mesh)
+    def respond(self, nodes: Nodes, held: Held, ends: Ends, loads: Sequence[Springs] = ()) -> Answer:
+        """Return the displacements of nodes whose contacts' ends move as expected, and the forces on these."""
+        stage = self._stage("respond", self.answered, held, loads)
+        return stage(nodes, held, ends, tuple(loads), jnp.float32(self.solver.stiffer), self.mesh)
 
     def move(self, nodes: Nodes, held: Held, ends: Ends, answer: Answer, pushed: Array) -> Moved:
         """Return the tissue after displacements `answer.shift` and those by additional forces [c, 3] on contacts, N."""
@@ -127,13 +122,16 @@ class TissueStep:
         stiffer = jnp.float32(self.solver.stiffer)
         return stage(nodes, held, ends.moving, ends.total, answer.shift, pushed, stiffer, self.mesh)
 
-    def _stage(self, kernel: str, reference: Callable[..., R], held: Held) -> Callable[..., R]:
+    def _stage(
+        self, kernel: str, reference: Callable[..., R], held: Held, loads: Sequence[Springs] = ()
+    ) -> Callable[..., R]:
         grid, (rows, q) = self.solver.grid, held.nodes.shape
         threads = min(MOST_THREADS, 32 * -(-grid.nodes // 64))
-        shared = 4 * (12 * grid.nodes + PAD * len(grid.first) + rows * (12 + 3 * q)) + 2 * grid.nodes + 640
+        springs = rows + sum(len(load.force) for load in loads)
+        shared = 4 * (12 * grid.nodes + PAD * len(grid.first) + springs * (12 + 2 * q)) + 2 * grid.nodes + 640
         if shared > MOST_SHARED or 3 * grid.nodes > PAD * len(grid.first):  # kernels keep nodes where bricks were
             return reference
-        return block_stage(reference, self.cuda(kernel, held), threads, f"tissue_{kernel}")
+        return block_stage(reference, self.cuda(kernel, held, loads), threads, f"tissue_{kernel}")
 
     @cached_property
     def softness(self) -> tuple[float, float]:
@@ -143,14 +141,14 @@ class TissueStep:
     # -- the reference
 
     def answered(
-        self, nodes: Nodes, held: Held, ends: Ends, stiffer: Any, mesh: Any, load: Load | None = None
+        self, nodes: Nodes, held: Held, ends: Ends, loads: tuple[Springs, ...], stiffer: Any, mesh: Any
     ) -> Answer:  # fmt: skip
         """Return what `respond` does."""
         del mesh  # for the kernel
         solver, dt, touched = self.solver.stiffened(stiffer), self.dt, ends.total > 0
+        for load in loads:
+            touched |= load.used > 0
         linear = solver.linearise(nodes, dt)
-        if load:
-            linear, touched = linear._replace(force=linear.force + load.force), touched | load.touching
         iterations = jnp.where(touched, TURNS, ALONE)
 
         def spring(row: Array, end: End, u: Array) -> tuple[Array, Array]:
@@ -164,22 +162,18 @@ class TissueStep:
         def improve(_: Any, found: tuple[Array, ...]) -> tuple[Array, ...]:
             u, residual, *_ = found
             springs = springs_at(u)
-            u, residual = solver.improved(linear, springs, u, residual, dt, iterations, ENOUGH, load and load.falls)
+            u, residual = solver.improved(linear, (springs, *loads), u, residual, dt, iterations, ENOUGH)
             return u, residual, springs.force, springs.stiffness
 
         def pulls(row: Array, _: End) -> Array:
             return force[row] - stiffness[row][FULL] @ _point(held, row, u)
 
         residual, rows = solver.residual(linear, linear.guess, dt), len(held.nodes)
-        if load:
-            residual -= load.falls(linear.guess)
         start = linear.guess, residual, jnp.zeros((rows, 3)), jnp.zeros((rows, 6))
         u, _, force, stiffness = jax.lax.fori_loop(0, jnp.where(touched, ROUNDS, 1), improve, start)
         if solver.loose:
-            springs = Springs(*held, force, stiffness, ends.total)
+            springs = Springs(*held, force, stiffness, ends.total), *loads
             left = solver.unbalanced(nodes, linear, springs, u, dt)
-            if load:
-                left += load.force - load.falls(u)
             u += solver.balanced(nodes.position, left, linear.inertia, springs)
         u = solver.shortened(nodes, u)  # tissue that is crushed presses back by what it really gives way
         force = each(ends, pulls)
@@ -215,7 +209,7 @@ class TissueStep:
         def pushed_on(shift: Array) -> Array:
             forces = jax.lax.fori_loop(0, moving, add, jnp.zeros_like(shift))
             linear = solver.linearise(nodes, dt)
-            u, _ = solver.improved(linear, None, jnp.zeros_like(shift), forces, dt, PUSHES, LITTLE)
+            u, _ = solver.improved(linear, (), jnp.zeros_like(shift), forces, dt, PUSHES, LITTLE)
             if solver.loose:
                 left = forces - linear.inertia[:, None] * u
                 u += solver.balanced(nodes.position, left, linear.inertia)
@@ -241,13 +235,13 @@ class TissueStep:
             around[grid.first + offset, corner] = PAD * np.arange(len(grid.first)) + 3 * corner
         return Mesh(grid.mass, support.stiffness, self.solver.free, support.rest, grid.first, around)
 
-    def cuda(self, kernel: str, held: Held) -> str:
-        """Return the CUDA code of a kernel, "respond" or "move", for contacts of this form."""
-        rows, q = held.nodes.shape
+    def cuda(self, kernel: str, held: Held, loads: Sequence[Springs] = ()) -> str:
+        """Return the CUDA code of a kernel, "respond" or "move", for contacts and loads of this form."""
+        (rows, q), springs = held.nodes.shape, sum(len(load.force) for load in loads)
         solver, dt = self.solver, self.dt
         grid, brick = solver.grid, solver.brick
         wholes = {
-            "NODES": grid.nodes, "BRICKS": len(grid.first), "ROOM": rows, "HELD": q, "PAD": PAD,
+            "NODES": grid.nodes, "BRICKS": len(grid.first), "ROOM": rows + springs, "HELD": q, "PAD": PAD,
             "LEVELS": grid.counts[2], "LOOSE": int(solver.loose),
             "STRIDE_X": grid.offsets[4], "STRIDE_Y": grid.offsets[2],
             "HOLDS": self.channels.first if self.channels else -1,
@@ -271,12 +265,15 @@ class TissueStep:
             f"y[{i}] = {' + '.join(f'{_real(row[j])} * x[{j}]' for j in np.flatnonzero(row))};"
             for i, row in enumerate(brick.hourglass)
         )
+        names = ("nodes", "weights", "force", "stiffness", "used")
+        borne = [", ".join(f"in.loads_{k}_{name}" for name in names) for k in range(len(loads))]
         parts = [
+            f"#define BEAR_LOADS {' '.join(f'bear({own}[0]);' for own in borne)}",
             f"enum {{ {', '.join(f'{name} = {x}' for name, x in wholes.items())} }};",
             f"constexpr float {', '.join(f'{name} = {_real(x)}' for name, x in reals.items())};",
             f"#define HOURGLASS(x, y) {terms}",
             *map(_source, ("brick_block", "brick", "brick_solve", f"tissue_{kernel}")),
-            "#undef HOURGLASS\n#undef EACH\n#undef EACH_NODE\n#undef UNROLL",
+            "#undef BEAR_LOADS\n#undef HOURGLASS\n#undef EACH\n#undef EACH_NODE\n#undef UNROLL",
         ]
         return "\n".join(parts)
 
