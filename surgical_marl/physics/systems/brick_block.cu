@@ -34,11 +34,12 @@ struct Block {
         }
 #endif
     }
-    // The nodes of a brick: places [n, 3] that begin at its first one become [8, 3].
+    // The nodes of a brick, by numbers from its first one; places [n, 3] that begin at that one become [8, 3].
+    static __device__ int corner(int node) { return (node & 4 ? STRIDE_X : 0) + (node & 2 ? STRIDE_Y : 0) + (node & 1); }
     static __device__ void corners(const float *first, float *found) {
         UNROLL
         for (int node = 0; node < 8; node++) {
-            const float *own = first + 3 * ((node & 4 ? STRIDE_X : 0) + (node & 2 ? STRIDE_Y : 0) + (node & 1));
+            const float *own = first + 3 * corner(node);
             UNROLL
             for (int i = 0; i < 3; i++) found[3 * node + i] = own[i];
         }

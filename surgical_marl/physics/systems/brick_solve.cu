@@ -222,26 +222,40 @@ const auto balance = [&](const float left[][3], int springs) {
     __syncthreads();
 };
 
-// Makes the displacements in p as much shorter as no brick is crushed, as `shortened` does; places come to `each`.
+// Makes the displacements in p shorter at bricks that would be crushed, as `shortened` does; places come to `each`.
 const auto shorten = [&]() {
-    float length = 1.0f, *x = each;
+    float *x = each, *share = each + 3 * NODES, *mark = each + 4 * NODES;
     __syncthreads();
     for (int k = thread; k < 3 * NODES; k += threads) x[k] = in.nodes_position[k];
+    for (int n = thread; n < NODES; n += threads) share[n] = 1.0f, mark[n] = 0.0f;
     __syncthreads();
-    for (bool crushed = true; crushed;) {
+    for (int round = 0;; round++) {
         bool any = false;
         for (int e = thread; e < BRICKS; e += threads) {
-            float before[24], after[24];
-            Block::corners(x + 3 * in.mesh_bricks[e], before);
-            Block::corners(p + 3 * in.mesh_bricks[e], after);
-            for (int i = 0; i < 24; i++) after[i] = before[i] + length * after[i];
-            any |= Brick::volume(after) < LEFT * Brick::volume(before);
+            float before[24], after[24], most = 0.0f;
+            const int first = in.mesh_bricks[e];
+            Block::corners(x + 3 * first, before);
+            Block::corners(p + 3 * first, after);
+            UNROLL
+            for (int node = 0; node < 8; node++) {
+                const float own = share[first + Block::corner(node)];
+                UNROLL
+                for (int i = 3 * node; i < 3 * node + 3; i++) after[i] = before[i] + own * after[i];
+                most = fmaxf(most, own);
+            }
+            const float was = Brick::volume(before);
+            if (most > 0 && Brick::volume(after) < fmaxf(LEFT * was, fminf(LEAST, was))) {
+                any = true;
+                for (int node = 0; node < 8; node++) mark[first + Block::corner(node)] = 1.0f;
+            }
         }
-        crushed = __syncthreads_or(any);
-        if (crushed) length = length > SHORTEST ? length / 2 : 0.0f;
-        crushed = crushed && length > 0;
+        if (!__syncthreads_or(any)) break;
+        for (int n = thread; n < NODES; n += threads) {
+            if (mark[n] > 0) share[n] *= round < HALVINGS ? 0.5f : 0.0f;
+            mark[n] = 0.0f;
+        }
+        __syncthreads();
     }
-    if (length < 1)
-        for (int k = thread; k < 3 * NODES; k += threads) p[k] *= length;
+    for (int k = thread; k < 3 * NODES; k += threads) p[k] *= share[k / 3];
     __syncthreads();
 };

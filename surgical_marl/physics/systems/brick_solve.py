@@ -26,8 +26,9 @@ from surgical_marl.physics.systems.brick_grid import BrickGrid
 from surgical_marl.physics.systems.rigid_motion import point_jacobian
 from surgical_marl.physics.systems.system import Springs
 
-LEFT, SHORTEST = 0.4, 1 / 16
-"""Share of its volume that a brick keeps in a step at least, and the shortest part of a step that is tried for this."""
+LEFT, LEAST, HALVINGS = 0.4, 0.01, 5
+"""Share of its volume that a brick keeps in a step at least; share of its volume at rest below which it loses none; and
+how often displacements are halved for this before there are none."""
 
 
 class Nodes(NamedTuple):
@@ -324,31 +325,48 @@ class BrickSolver:
         return self.moved(state, self.displacements(linear, springs, linear.guess, dt), dt)
 
     def shortened(self, state: Nodes, u: Array) -> Array:
-        """Return displacements u, m, [n, 3], as much shorter as no brick needs to keep a share `LEFT` of its volume.
+        """Return displacements u, m, [n, 3], shorter at bricks that would be crushed: `LEFT` and `LEAST` say how far.
 
-        One linearisation does not see how fast the resistance of a crushed brick grows.
+        One linearisation does not see how fast the resistance of a crushed brick grows. Its nodes go half as far, and
+        again, and do not move at last. All others go as far as they would.
         """
+        offsets, bricks = jnp.asarray(self.grid.offsets), jnp.asarray(self.grid.first)
 
         def volume(x: Array) -> Array:
             gradient = self.brick.gradient(to_modes(x))
             return gradient[0] @ jnp.cross(gradient[1], gradient[2])
 
-        def crushed(length: Array) -> Array:
-            def look(found: Array, first: Array) -> tuple[Array, None]:
-                nodes = first + jnp.asarray(self.grid.offsets)
-                x = state.position[nodes]
-                return found | (volume(x + length * u[nodes]) < LEFT * volume(x)), None
+        def crushed(nodes: Array, share: Any) -> Array:
+            x = state.position[nodes]
+            before = volume(x)
+            return volume(x + share * u[nodes]) < jnp.maximum(LEFT * before, jnp.minimum(LEAST, before))
 
-            any_: Array = jax.lax.scan(look, jnp.bool_(False), jnp.asarray(self.grid.first))[0]
-            return any_
+        def look(found: Array, first: Array) -> tuple[Array, None]:
+            return found | crushed(first + offsets, 1.0), None
 
-        def shorten(found: tuple[Array, Array]) -> tuple[Array, Array]:
-            length = jnp.where(found[0] > SHORTEST, found[0] / 2, 0.0)
-            return length, (length > 0) & crushed(length)
+        def halve(found: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+            shares, rounds, _ = found
 
-        one = jnp.float32(1.0)
-        length, _ = jax.lax.while_loop(lambda found: found[1], shorten, (one, crushed(one)))
-        found: Array = jax.lax.cond(length < 1, lambda: jax.lax.map(lambda row: length * row, u), lambda: u)
+            def mark(found: tuple[Array, Array], first: Array) -> tuple[tuple[Array, Array], None]:
+                nodes, (marks, any_) = first + offsets, found
+                own = shares[nodes]
+                bad = (jnp.max(own) > 0) & crushed(nodes, own[:, None])
+                marks = marks.at[nodes].set(marks[nodes] | bad, mode="promise_in_bounds")
+                return (marks, any_ | bad), None
+
+            (marks, any_), _ = jax.lax.scan(mark, (jnp.zeros(len(u), bool), jnp.bool_(False)), bricks)
+            less = jnp.where(rounds < HALVINGS, 0.5, 0.0)
+            shares = jax.lax.map(lambda row: jnp.where(row[0], less * row[1], row[1]), (marks, shares))
+            return shares, rounds + 1, any_
+
+        def shorten() -> Array:
+            start = jnp.ones(len(u), jnp.float32), jnp.int32(0), jnp.bool_(True)
+            shares, *_ = jax.lax.while_loop(lambda found: found[2], halve, start)
+            found: Array = jax.lax.map(lambda row: row[0] * row[1], (shares, u))
+            return found
+
+        any_, _ = jax.lax.scan(look, jnp.bool_(False), bricks)
+        found: Array = jax.lax.cond(any_, shorten, lambda: u)
         return found
 
     def stretched(self, position: Array, limit: float) -> Array:

@@ -23,7 +23,7 @@ from surgical_marl.engines.stages import MOST_SHARED, block_stage
 from surgical_marl.physics.contact.spring_contact import each, feel
 from surgical_marl.physics.solver.cholesky import FULL, LOWER
 from surgical_marl.physics.systems.brick import CRUSHED, EVENED, ITERATIONS, RESISTANCE
-from surgical_marl.physics.systems.brick_solve import LEFT, SHORTEST, BrickSolver, Nodes
+from surgical_marl.physics.systems.brick_solve import HALVINGS, LEAST, LEFT, BrickSolver, Nodes
 from surgical_marl.physics.systems.channel import Channels
 from surgical_marl.physics.systems.system import End, Ends, Springs
 from surgical_marl.physics.tree_utils import put, row_of
@@ -129,7 +129,7 @@ class TissueStep:
         threads = min(MOST_THREADS, 32 * -(-grid.nodes // 64))
         springs = rows + sum(len(load.force) for load in loads)
         shared = 4 * (12 * grid.nodes + PAD * len(grid.first) + springs * (12 + 2 * q)) + 2 * grid.nodes + 640
-        if shared > MOST_SHARED or 3 * grid.nodes > PAD * len(grid.first):  # kernels keep nodes where bricks were
+        if shared > MOST_SHARED or 5 * grid.nodes > PAD * len(grid.first):  # kernels keep nodes where bricks were
             return reference
         return block_stage(reference, self.cuda(kernel, held, loads), threads, f"tissue_{kernel}")
 
@@ -246,7 +246,8 @@ class TissueStep:
             "STRIDE_X": grid.offsets[4], "STRIDE_Y": grid.offsets[2],
             "HOLDS": self.channels.first if self.channels else -1,
             "PRESSES": self.channels.pressing if self.channels else -1,
-            "ROUNDS": ROUNDS, "TURNS": TURNS, "ALONE": ALONE, "PUSHES": PUSHES, "EVENED": EVENED, "NEWTON": ITERATIONS,
+            "ROUNDS": ROUNDS, "TURNS": TURNS, "ALONE": ALONE, "PUSHES": PUSHES,
+            "HALVINGS": HALVINGS, "EVENED": EVENED, "NEWTON": ITERATIONS,
         }  # fmt: skip
         diagonal = {
             f"DIAGONAL_{a}{b}": brick.diagonal[0, i, j]
@@ -258,7 +259,7 @@ class TissueStep:
         reals = diagonal | upright | {f"SLOPE_{axis}": x for axis, x in zip("XYZ", -2 / brick.size, strict=True)} | {
             "VOLUME": brick.volume, "LAME": brick.lame, "SHEAR": brick.shear, "CRUSHED": CRUSHED,
             "RESISTANCE": RESISTANCE * brick.young, "DT": dt, "BLEND": 1 + solver.damping / dt,
-            "GRAVITY": solver.gravity[2], "ENOUGH": ENOUGH, "LITTLE": LITTLE, "LEFT": LEFT, "SHORTEST": SHORTEST,
+            "GRAVITY": solver.gravity[2], "ENOUGH": ENOUGH, "LITTLE": LITTLE, "LEFT": LEFT, "LEAST": LEAST,
             "TEARS": self.tears or 0, "BESIDE": self.softness[0], "ACROSS": self.softness[1],
         }  # fmt: skip
         terms = " ".join(
