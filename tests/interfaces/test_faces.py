@@ -29,7 +29,7 @@ from tests.helpers.scenes import APART
 
 STEPS = 6
 CONTROLS = ("position", "velocity", "torque")
-QUICK = {("reach", "psm", "position"), ("track", "star", "velocity"), ("match_image", "ecm", "position")}
+QUICK = {("reach", "psm", "position"), ("track", "star", "position"), ("match_image", "ecm", "position")}
 
 
 def combinations() -> list[Any]:

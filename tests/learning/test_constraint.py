@@ -112,23 +112,23 @@ class Tempting(FakeEnv):
         return drawn
 
 
-@pytest.mark.parametrize("limit", [0.1, 1.0])
+@pytest.mark.parametrize("limit", [0.1, pytest.param(1.0, marks=pytest.mark.slow)])
 def test_a_limit_is_held(limit: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(train, "make_env", lambda settings: Tempting({"psm": 2}, SIZES, settings.num_envs, 10))
     settings = Settings(
         num_envs=256,
-        iterations=60,
+        iterations=40,
         steps_per_iteration=16,
         ppo=PPOSettings(learning_rate=3e-3, gamma=0.9, mini_batches=2, normalise_values=True),
         network=NetworkSettings(hidden=(32, 32)),
         constraint=ConstraintSettings(cost="collision", limit=limit, kp=10.0, ki=1.0, kd=0.0),
     )
     rows = read_metrics(train.train(settings, out=tmp_path / "run"))
-    late = [row["cost_rate"] for row in rows[-20:]]
+    late = [row["cost_rate"] for row in rows[-15:]]
     if limit == 1.0:
         assert min(late) > 0.9 and all(row["lagrange_multiplier"] == 0.0 for row in rows)
     else:
-        assert sum(late) / 20 < 2 * limit and rows[-1]["lagrange_multiplier"] > 0.0
+        assert sum(late) / 15 < 2 * limit and rows[-1]["lagrange_multiplier"] > 0.0
     for row in rows:
         assert row["cost_rate"] == pytest.approx(row["collision_rate"], abs=1e-6)
 

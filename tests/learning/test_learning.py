@@ -64,7 +64,7 @@ def test_the_toy_is_learned(algo: Any, tmp_path: Path, fakes: list[Any]) -> None
         SMALL,
         algo=algo,
         num_envs=256,
-        iterations=40,
+        iterations=25,
         steps_per_iteration=16,
         ppo=ppo,
         network=NetworkSettings(hidden=(32, 32)),

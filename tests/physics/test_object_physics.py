@@ -219,6 +219,7 @@ def test_what_spins_on_a_floor_slows_as_in_plain_mujoco_and_as_coulomb_says(tmp_
     np.testing.assert_allclose(theirs, coulomb, rtol=0.02)
 
 
+@pytest.mark.slow
 def test_what_an_arm_slides_along_a_floor_stays_on_it(tmp_path: Path) -> None:
     """A sled is pushed as hard as friction resists, so it slides at the same speed all the time. If it counts as held,
     a step knows that. If not, it takes the sled to be slowed by friction, and its cone lifts it."""

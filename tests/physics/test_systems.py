@@ -99,6 +99,7 @@ def test_what_a_finger_feels_is_in_the_outputs(pushed: tuple[Simulator, Any, Any
         assert (float(touch.handled[0, 0]) > 0.01) == felt
 
 
+@pytest.mark.slow
 def test_both_engines_move_it_alike(tmp_path: Path) -> None:
     found = []
     for engine in ("mjx", "fused"):

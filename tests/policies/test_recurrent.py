@@ -147,7 +147,7 @@ class Hidden(FakeEnv):
         return super().reset(seed, first)
 
 
-@pytest.mark.parametrize("kind", ["none", "gru"])
+@pytest.mark.parametrize("kind", [pytest.param("none", marks=pytest.mark.slow), "gru"])
 def test_what_was_seen_once_is_remembered(kind: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def hidden(num_envs: int) -> Any:
         return Hidden({"psm": 1}, {"psm": 1}, num_envs, max_steps=8)
@@ -155,7 +155,7 @@ def test_what_was_seen_once_is_remembered(kind: Any, tmp_path: Path, monkeypatch
     monkeypatch.setattr(train, "make_env", lambda settings: hidden(settings.num_envs))
     asked = Settings(
         num_envs=256,
-        iterations=60,
+        iterations=40,
         steps_per_iteration=16,
         ppo=PPOSettings(learning_rate=3e-3, gamma=0.9, epochs=4, mini_batches=2),
         network=NetworkSettings(hidden=(32, 32), recurrent=kind),

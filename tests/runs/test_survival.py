@@ -46,7 +46,7 @@ def test_killed_at_a_moment(moment: str, whole: Path, tmp_path: Path) -> None:
 def test_killed_at_random_moments(tmp_path: Path) -> None:
     moments = random.Random(0)
     broken, unbroken = tmp_path / "broken", tmp_path / "unbroken"
-    for _ in range(20):
+    for _ in range(10):
         process = start(run_or_resume, LONG, broken)
         time.sleep(moments.uniform(0.0, 0.6))
         process.kill()
