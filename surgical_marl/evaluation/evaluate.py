@@ -10,6 +10,7 @@ import json
 import math
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -32,6 +33,7 @@ from surgical_marl.evaluation.metrics import (
     VIEWED,
     Metric,
     Trajectory,
+    courses,
     measure,
     metrics,
 )
@@ -46,6 +48,8 @@ if TYPE_CHECKING:
 
 
 EPISODES = "episodes.npz"
+COURSE = "course/"
+"""How names of courses begin there."""
 MEASURES = ("error", "held", "squared", "distance", "center", "success", "collided", "time", "path", "smoothness",
             "action_change")  # fmt: skip
 """Measures of every task."""
@@ -70,6 +74,8 @@ class Played(NamedTuple):
     """True if the task's goals move."""
     stages: tuple[str, ...] = ()
     """Stages of the task, in order."""
+    courses: Mapping[str, np.ndarray] = MappingProxyType({})
+    """[points, E] each, equally spaced over `max_steps`, see `surgical_marl.evaluation.metrics.courses`."""
 
 
 def evaluate(
@@ -102,7 +108,7 @@ def play(
     """
     if episodes < 1:
         raise ValueError(f"episodes must be 1 or more, not {episodes}")
-    blocks, goals, count_blocks = [], [], math.ceil(episodes / env.num_envs)
+    blocks, ways, goals, count_blocks = [], [], [], math.ceil(episodes / env.num_envs)
     bar = progress(count_blocks * env.max_steps, "step", show) if show else None
     for block in range(count_blocks):
         count = min(env.num_envs, episodes - block * env.num_envs)
@@ -111,14 +117,16 @@ def play(
         goals += read_goals(env, count)
         trajectory = _first_episodes(env, policy, observations, count, bar)
         blocks.append(measure(trajectory, env.control_dt, env.task.follows))
+        ways.append(courses(trajectory, env.max_steps))
         if bar is not None:
             bar.update((block + 1) * env.max_steps - bar.n)  # episodes may be shorter
     if bar is not None:
         bar.close()
     about = describe_goals(env, episodes)
     measures = {name: np.concatenate([block[name] for block in blocks]) for name in blocks[0]}
+    over_time = {name: np.concatenate([way[name] for way in ways], 1) for name in ways[0]}
     found = {**about, "seed": seed, "goal_set": goal_hash(about, goals)}
-    return Played(found, list(env.agents), measures, env.task.follows, env.task.stages)
+    return Played(found, list(env.agents), measures, env.task.follows, env.task.stages, over_time)
 
 
 def summarise(runs: Sequence[Played]) -> Evaluation:
@@ -239,10 +247,14 @@ def _numpy(values: Any, count: int) -> np.ndarray:
 
 
 def write_played(path: Path, played: Played) -> None:
-    """Write episodes as an npz file of float32 arrays [E, A], one for each measure, and `about`, a text in JSON."""
+    """Write episodes as an npz file of float32 arrays: [E, A] for each measure, and [points, E] for each course.
+
+    The names of courses begin with "course/". `about` is a text in JSON.
+    """
     about = {name: getattr(played, name) for name in ("about", "agents", "follows", "stages")}
-    measures = {name: values.astype(np.float32) for name, values in played.measures.items()}
-    write_npz(path, {"about": np.array(json.dumps(about)), **measures})
+    courses = {f"{COURSE}{name}": values for name, values in played.courses.items()}
+    arrays = {name: values.astype(np.float32) for name, values in (dict(played.measures) | courses).items()}
+    write_npz(path, {"about": np.array(json.dumps(about)), **arrays})
 
 
 def read_played(path: Path) -> Played:
@@ -251,13 +263,16 @@ def read_played(path: Path) -> Played:
         found = read_npz(path)
         kept = json.loads(str(found.pop("about")))
         agents = [str(agent) for agent in kept["agents"]]
-        measures = {name: values.astype(float) for name, values in found.items()}
-        shape = measures["error"].shape
+        arrays = {name: values.astype(float) for name, values in found.items()}
+        ways = {name.removeprefix(COURSE): arrays.pop(name) for name in found if name.startswith(COURSE)}
+        measures, shape = arrays, arrays["error"].shape
         if len(shape) != 2 or shape[1] != len(agents) or any(values.shape != shape for values in measures.values()):
             raise ValueError(shape)
+        if any(values.ndim != 2 or values.shape[1] != shape[0] or not len(values) for values in ways.values()):
+            raise ValueError(list(ways))
         if not {*MEASURES} <= measures.keys():
             raise ValueError(list(measures))
         stages = tuple(str(stage) for stage in kept["stages"])
-        return Played(dict(kept["about"]), agents, measures, bool(kept["follows"]), stages)
+        return Played(dict(kept["about"]), agents, measures, bool(kept["follows"]), stages, ways)
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
         raise ValueError(f"{path} is damaged, or not the episodes of an evaluation: evaluate the run again") from None

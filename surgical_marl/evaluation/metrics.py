@@ -45,8 +45,14 @@ BITES = {
     "bite_depth": ("bite_depth_mm", 1000.0),
 }
 """Infos of a needle in tissue whose value after the last step counts, likewise; of all episodes, their median."""
-PEAK = {"contact_force": ("peak_force_n", 1.0), "tissue_force": ("max_tissue_force_n", 1.0)}
+PEAK = {
+    "contact_force": ("peak_force_n", 1.0),
+    "tissue_force": ("max_tissue_force_n", 1.0),
+    "tension": ("max_tension_n", 1.0),
+}
 """Infos whose largest value of all steps counts, likewise."""
+COURSES, POINTS = ("tissue_force", "tension"), 100
+"""Infos that are the same for all agents, whose course over time is kept, at this many points at most."""
 STILL = 1e-3
 """A tip that moved less than this, in m, has no smoothness, because its motion is noise."""
 
@@ -139,6 +145,24 @@ def measure(trajectory: Trajectory, dt: float, following: bool) -> dict[str, np.
             for name, values in trajectory.terms.items()
         },
     }
+
+
+def courses(trajectory: Trajectory, max_steps: int) -> dict[str, np.ndarray]:
+    """Return the course of each of `COURSES` that an episode of up to `max_steps` steps has, [points, E].
+
+    A point is the largest value of an equal share of `max_steps`, so that none is passed over; NaN after the end.
+    """
+    points = min(POINTS, max_steps)
+    steps = np.arange(len(trajectory.error))
+    going = steps[:, None] < trajectory.lengths
+    found = {}
+    for name in COURSES:
+        if name in trajectory.terms:
+            course = np.full((points, len(trajectory.lengths)), np.nan)
+            values = np.where(going, trajectory.terms[name][..., 0], np.nan)
+            np.fmax.at(course, steps * points // max_steps, values)
+            found[name] = course
+    return found
 
 
 def _reduced(name: str, values: np.ndarray, where: np.ndarray, final: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Charts of an evaluation: errors, success against threshold, stages, distances, forces, time to success."""
+"""Charts of an evaluation: errors, success against threshold, stages, distances, forces, time to success, courses."""
 
 from __future__ import annotations
 
@@ -8,9 +8,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from surgical_marl.evaluation.evaluate import Played
 from surgical_marl.evaluation.interval import interval
 from surgical_marl.evaluation.metrics import HOLD, STAGE, THRESHOLDS_MM, Metric, mean_of_known, success
-from surgical_marl.report.charts import SHARE, Chart, Drawing, Line, Scale, Text, percent, plain
+from surgical_marl.report.charts import NUMBER, SHARE, Chart, Drawing, Line, Scale, Text, percent, plain
 from surgical_marl.report.groups import Group, stacked
 
 THRESHOLDS, BINS = 24, 24
@@ -44,6 +45,12 @@ HISTOGRAMS = (
     Histogram("contact_force", 1.0, "Peak contact force (N)", "largest force of an episode (N)"),
 )
 
+COURSES = (
+    ("tissue_force", "Force on tissue over time (N)", "the largest force on tissue"),
+    ("tension", "Tension of thread over time (N)", "the largest tension of a thread"),
+)
+"""What is drawn over time: its name, the title of its chart, and words for it."""
+
 
 def charts(drawing: Drawing, groups: Sequence[Group]) -> list[Chart]:
     """Return all charts that the groups' episodes allow."""
@@ -54,6 +61,8 @@ def charts(drawing: Drawing, groups: Sequence[Group]) -> list[Chart]:
     following = any(found[0].follows for _, _, found in played if found)
     series = by_group if len(groups) > 1 else _by_agent(by_group[0], groups[0].played[0].agents)
     found = [_threshold(drawing, series, following), *(_histogram(drawing, series, kind) for kind in HISTOGRAMS)]
+    over_time = [(number, group.label, group.played) for number, group, _ in played]
+    found += [_course(drawing, over_time, *course) for course in COURSES]
     found.insert(2, _stages(drawing, series, next(found[0].stages for _, _, found in played if found)))
     return [chart for chart in found if chart is not None]
 
@@ -138,6 +147,37 @@ def _histogram(drawing: Drawing, series: Sequence[Series], kind: Histogram) -> C
         _legend(shown),
     )
     return drawing.lines(text, lines, Scale(plain, (edges[0], edges[-1]), log=log), Scale(percent), label)
+
+
+def _course(
+    drawing: Drawing, groups: Sequence[tuple[int, str, Sequence[Played]]], name: str, title: str, words: str
+) -> Chart | None:
+    """Draw the median over episodes of a number over time, with a band from the 5th to the 95th percentile."""
+    lines, columns, shown = [], [], []
+    for number, label, played in groups:
+        courses = [one.courses[name] for one in played if name in one.courses]
+        if not courses or len({len(one) for one in courses}) > 1:
+            continue
+        every, about = np.concatenate(courses, 1), played[0].about
+        going = np.isfinite(every).any(1)
+        time = float(about["max_steps"] * about["control_dt"]) * (np.arange(len(every)) + 1) / len(every)
+        low, middle, high = np.nanpercentile(every[going], [5, 50, 95], axis=1)
+        lines.append(Line(number, time[going], middle, (low, high)))
+        columns.append([(plain(t), *map(plain, row)) for t, *row in zip(time[going], low, middle, high, strict=True)])
+        shown.append((label, number))
+    if not lines or not any(line.y.any() or (line.band is not None and line.band[1].any()) for line in lines):
+        return None
+    rows = [(label, *row) for (label, _), column in zip(shown, columns, strict=True)
+            for row in column[:: max(1, len(column) // ROWS)]]  # fmt: skip
+    text = Text(
+        title,
+        f"Over the episodes that go on, {words} in each share of the time: the median, and a band from the 5th to the "
+        "95th percentile.",
+        ["episodes of", "time (s)", "5th percentile (N)", "median (N)", "95th percentile (N)"],
+        rows,
+        tuple(shown) if len(shown) > 1 else (),
+    )
+    return drawing.lines(text, lines, NUMBER, NUMBER, "time (s)")
 
 
 def _edges(values: np.ndarray, log: bool) -> np.ndarray:

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from scipy.stats import binomtest
 
 from surgical_marl.evaluation.interval import interval, over_seeds
-from surgical_marl.evaluation.metrics import HOLD, Metric, Trajectory, measure, metrics, spectral_arc_length
+from surgical_marl.evaluation.metrics import HOLD, Metric, Trajectory, courses, measure, metrics, spectral_arc_length
 
 DT = 0.04  # success is judged over five steps
 
@@ -90,6 +90,19 @@ def test_measures_equal_plain_loops(seed: int, lengths: list[int], arms: int, fo
         for arm in range(arms):
             for name, value in expected(trajectory, episode, arm, following).items():
                 assert found[name][episode, arm] == pytest.approx(value, rel=1e-9, nan_ok=True), name
+
+
+@pytest.mark.parametrize("max_steps", [7, 100, 250])
+def test_a_course_has_the_largest_of_each_share_of_the_time(max_steps: int) -> None:
+    rng, lengths = np.random.default_rng(0), [7, 3]
+    force = rng.random((7, 2, 1)).repeat(2, 2)
+    trajectory = random_trajectory(0, lengths, 2)._replace(terms={"tissue_force": force, "cost": force})
+    found, points = courses(trajectory, max_steps), min(100, max_steps)
+    assert found.keys() == {"tissue_force"} and found["tissue_force"].shape == (points, 2)
+    for episode, length in enumerate(lengths):
+        for point in range(points):
+            seen = [force[t, episode, 0] for t in range(length) if t * points // max_steps == point]
+            assert found["tissue_force"][point, episode] == pytest.approx(max(seen, default=math.nan), nan_ok=True)
 
 
 def test_an_object_is_dropped_once_and_at_its_goal_from_when_it_stays() -> None:

@@ -180,6 +180,22 @@ def test_a_damaged_evaluation_is_left_out(damage: str, tmp_path: Path) -> None:
     assert found.notes[0] in Page(render([found])).text
 
 
+def test_force_and_tension_are_drawn_over_time(tmp_path: Path) -> None:
+    """From the file of the episodes, in the unit that is said; a thread that was never pulled is left out."""
+    course = np.where(np.arange(20) < np.arange(1, 11)[:, None] * 2, np.nan, 1.5)  # [points, E]: each ends at its time
+    course[-1] = np.nan
+    found = played()._replace(courses={"tissue_force": course, "tension": 0 * course})
+    run = evaluate(make_run(tmp_path / "run"), found)
+    again = read_played(run / EPISODES)
+    np.testing.assert_array_equal(again.courses["tissue_force"], course)
+    assert again.measures.keys() == found.measures.keys()
+    page = Page(render([read_run(run)]))
+    assert "Force on tissue over time (N)" in page.text and "Tension of thread" not in page.text
+    assert re.search(r"0\.2\s*1\.5\s*1\.5\s*1\.5", page.text)
+    write_played(run / EPISODES, found._replace(courses={"tissue_force": course[:, :3]}))
+    assert "damaged" in read_run(run).notes[0]
+
+
 def test_damaged_episodes_are_left_out(tmp_path: Path) -> None:
     run = evaluate(make_run(tmp_path / "run"))
     write_played(run / EPISODES, again := read_played(run / EPISODES))
