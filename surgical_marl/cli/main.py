@@ -20,6 +20,7 @@ from typing import Any, NoReturn
 from surgical_marl.cli.benching import add_bench
 from surgical_marl.cli.checks import check_level, check_names
 from surgical_marl.cli.evaluating import add_crossplay, add_eval, add_report
+from surgical_marl.cli.exporting import add_export_episodes
 from surgical_marl.cli.flags import add_flags, given, one_of, task_help
 from surgical_marl.cli.viewing import add_play, add_replay, add_view
 from surgical_marl.content import find, list_arms, list_objects, list_policies, list_scenes
@@ -185,8 +186,9 @@ def _parser() -> argparse.ArgumentParser:
     audit.add_argument("--scene", help="in which a task is looked at (default: the task's own, or psm)")
     audit.set_defaults(command=_check, name="check")
 
-    export = commands.add_parser("export", help="write a scene for other programs, or a policy to pass on")
-    kinds = export.add_subparsers(required=True, metavar="{scene,policy}")
+    export = commands.add_parser("export", help="write episodes or a scene for other programs, or a policy to pass on")
+    kinds = export.add_subparsers(required=True, metavar="{episodes,scene,policy}")
+    add_export_episodes(kinds)
     scene = kinds.add_parser("scene", help="a scene as one file for MuJoCo")
     scene.add_argument("source", metavar="NAME_OR_PATH", help="a scene's name or .yaml file")
     scene.add_argument("--format", type=one_of(("mjcf",)), default="mjcf", metavar="mjcf", help="MuJoCo's XML")

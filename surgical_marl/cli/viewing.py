@@ -21,34 +21,36 @@ from surgical_marl.tasks.base.options import SAME, Options
 from surgical_marl.untrusted.files import is_file, user_path
 from surgical_marl.untrusted.values import plural
 
-_OWN = (*SAME[2:], "difficulty", "start", "goals")
+OWN = (*SAME[2:], "difficulty", "start", "goals")
 
 
 def add_view(commands: Any) -> None:
     """Add the command view."""
     parser = commands.add_parser("view", help="a task in the browser, policies or people at the arms (docs/viewer.md)")
-    _add_what(parser)
+    parser.add_argument("task", metavar="TASK", help=task_help())
+    add_what(parser)
     parser.add_argument("--num-envs", type=whole(1, 4), default=1, metavar="N", help="environments side by side")
     parser.add_argument("--port", type=whole(0, 65535), default=8080, metavar="N", help="of the page; 0 for any")
     parser.add_argument(
         "--record", type=user_path, metavar="DIR", help="keep what was done, for `surgical-marl replay`"
     )
-    parser.set_defaults(check=_check_shown, command=_view, name="view")
+    parser.set_defaults(check=check_shown, command=_view, name="view")
 
 
 def add_play(commands: Any) -> None:
     """Add the command play."""
     parser = commands.add_parser("play", help="a film of a policy, from outside, from near and from the endoscope")
-    _add_what(parser)
+    parser.add_argument("task", metavar="TASK", help=task_help())
+    add_what(parser)
     parser.add_argument("--out", type=user_path, required=True, metavar="FILE", help="an .mp4, a .gif or a .webp")
     parser.add_argument("--episodes", type=whole(1, 1000), default=1, metavar="N")
-    grid = _pair("rows and columns such as 4x4")
+    grid = pair("rows and columns such as 4x4")
     parser.add_argument("--grid", type=grid, default=(1, 1), metavar="RxC", help="so many environments, such as 4x4")
     parser.add_argument("--slow", type=_number, default=1.0, metavar="X", help="times slower than real time")
     what = "a camera of the scene by name, or AZIMUTH,ELEVATION,DISTANCE in degrees and m about the tool tips"
     parser.add_argument("--camera", metavar="CAMERA", help=what)
     what = "pixels of the film, or of each picture in a grid (default: 1280x720, and less in a grid)"
-    parser.add_argument("--size", type=_pair("width and height in pixels such as 640x480"), metavar="WxH", help=what)
+    parser.add_argument("--size", type=pair("width and height in pixels such as 640x480"), metavar="WxH", help=what)
     parser.add_argument("--plain", action="store_true", help="without words")
     parser.set_defaults(check=_check_play, command=_play, name="play")
 
@@ -61,15 +63,17 @@ def add_replay(commands: Any) -> None:
     parser.set_defaults(check=_check_replay, command=_replay, name="replay")
 
 
-def _add_what(parser: argparse.ArgumentParser) -> None:
-    """Add the flags of task, scene, policy and options that are shown."""
-    parser.add_argument("task", metavar="TASK", help=task_help())
+def add_what(parser: argparse.ArgumentParser, policy: str = "the policy that ships, or oracle") -> None:
+    """Add the flags of scene, policy and options of the episodes that a command is about.
+
+    `policy` is the text for `--help` on what plays where no policy is named.
+    """
     parser.add_argument(
         "--scene", help="a name (see `list scenes`) or a .yaml file (default: the policy's, or else the task's own)"
     )
-    what = f"a run folder, a policy's name, {', '.join(BASELINES)} (default: the policy that ships, or oracle)"
+    what = f"a run folder, a policy's name, {', '.join(BASELINES)} (default: {policy})"
     parser.add_argument("--policy", metavar="RUN_OR_POLICY", help=what)
-    add_flags(parser, Options, _OWN, default="the policy's own")
+    add_flags(parser, Options, OWN, default="the policy's own")
     parser.add_argument("--seed", type=whole(0, 2**31 - 1), default=0, metavar="S")
 
 
@@ -91,7 +95,7 @@ def _view(arguments: argparse.Namespace) -> None:
 
 def _open(arguments: argparse.Namespace) -> Any:
     """Return the viewer that is asked for."""
-    settings, who = _settings(arguments)
+    settings, who = settings_of(arguments)
     from surgical_marl.view.browser.server import check_port, check_viser
 
     check_viser()  # this and the port are looked at before anything is compiled
@@ -119,7 +123,7 @@ def _play(arguments: argparse.Namespace) -> None:
 
 def _film(arguments: argparse.Namespace) -> Path:
     """Write the film that is asked for, and return its path."""
-    settings, who = _settings(arguments)
+    settings, who = settings_of(arguments)
 
     from surgical_marl.runs.settings import make_env
     from surgical_marl.view.film import Look, camera_of, film
@@ -132,7 +136,7 @@ def _film(arguments: argparse.Namespace) -> Path:
     return film(env, movers, arguments.out, look, arguments.episodes, arguments.seed)
 
 
-def _pair(what: str) -> Callable[[str], tuple[int, int]]:
+def pair(what: str) -> Callable[[str], tuple[int, int]]:
     """Return a reader, for `add_argument(type=...)`, of two whole numbers with an x between them."""
 
     def read(text: str) -> tuple[int, int]:
@@ -189,10 +193,10 @@ def _reproduce(file: Path, about: Any, arrays: Any) -> int:
 
 def _check_play(arguments: argparse.Namespace) -> None:
     check_file("--out", arguments.out, ".mp4", ".gif", ".webp")
-    _check_shown(arguments)
+    check_shown(arguments)
 
 
-def _check_shown(arguments: argparse.Namespace) -> None:
+def check_shown(arguments: argparse.Namespace) -> None:
     """Raise ValueError unless task, scene and policy exist and fit together; fill in the scene if it is not given."""
     check_names(arguments)
     if arguments.policy is not None:
@@ -213,13 +217,13 @@ def _check_replay(arguments: argparse.Namespace) -> None:
         raise ValueError(f"there is no file {arguments.file}")
 
 
-def _settings(arguments: argparse.Namespace) -> tuple[Any, str | None]:
+def settings_of(arguments: argparse.Namespace) -> tuple[Any, str | None]:
     """Return the settings of the environment, and who moves the arms; ValueError if they don't fit together."""
     # for policies that need torch: with few environments its threads wait for each other longer than they compute
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     from surgical_marl.evaluation.environment import common_settings
 
-    asked = {key: getattr(arguments, key) for key in ("task", "scene", *_OWN)}
+    asked = {key: getattr(arguments, key) for key in ("task", "scene", *OWN)}
     settings = common_settings([arguments.policy or "zero"], {**asked, "goals": asked["goals"] or "training"})
 
     return replace(settings, seed=arguments.seed), arguments.policy

@@ -209,8 +209,8 @@ def _commit() -> str | None:
 
 
 @contextlib.contextmanager
-def owned(run: Path) -> Iterator[None]:
-    """Hold the lock of a run folder.
+def owned(run: Path, doing: str = "trains in it") -> Iterator[None]:
+    """Hold the lock of a run folder, or of another one in which a process is `doing` something.
 
     Where there is no folder yet, or the system can't lock files in it, nothing is locked.
 
@@ -226,7 +226,7 @@ def owned(run: Path) -> Iterator[None]:
             held.callback(lock.release)
         except Timeout:
             raise ValueError(
-                f"{run} is in use: another process trains in it; wait until it ends, or name another folder"
+                f"{run} is in use: another process {doing}; wait until it ends, or name another folder"
             ) from None
         except (OSError, NotImplementedError):
             pass

@@ -104,9 +104,43 @@ def replay(path: Path) -> Replayed:
     Raises:
         ValueError: it is no take, or what it was recorded in can't be made here.
     """
+    take = open_take(path)
+    env, arrays, first, largest = take.env, take.arrays, None, 0.0
+    env.set_carry(start_of(arrays))
+    for number in range(take.steps):
+        step = env.step({agent: arrays[f"actions/{agent}"][number] for agent in env.agents})
+        for name, value in _after(env, step).items():
+            wanted = arrays[name][number]
+            if wanted.shape != value.shape:
+                raise ValueError(f"{path} is no whole take: {name} has the shape {wanted.shape}, not {value.shape}")
+            if not np.array_equal(wanted, value, equal_nan=True):
+                first = number if first is None else first
+                if name in ("qpos", "objects"):
+                    largest = max(largest, float(np.max(np.abs(wanted - value), initial=0.0)))
+    env.close()
+    return Replayed(take.steps, first, largest, changed_versions(take.about["versions"]))
+
+
+class OpenTake(NamedTuple):
+    """A take, and environments of its own in which it can be stepped again."""
+
+    settings: Settings
+    env: BatchedEnv
+    about: dict[str, Any]
+    arrays: dict[str, np.ndarray]
+    steps: int
+
+
+def open_take(path: Path, **options: Any) -> OpenTake:
+    """Read a take, and make its environments; `options` replace some of theirs.
+
+    Raises:
+        ValueError: it is no take, or what it was recorded in can't be made here.
+    """
     about, arrays = read_take(path)
     try:
-        settings = made_in(about["environment"], path, engine=about["engine"], device=about["device"])
+        own = {**about["environment"], **options}
+        settings = made_in(own, path, engine=about["engine"], device=about["device"])
     except TypeError:  # options of another version
         raise ValueError(f"{path} was recorded in an environment that this version does not know") from None
     env = make_env(settings, about["num_envs"], "numpy")
@@ -118,24 +152,17 @@ def replay(path: Path) -> Replayed:
     }
     if missing := sorted(needed - arrays.keys()):
         raise ValueError(f"{path} is no whole take: it lacks {', '.join(missing)}")
-    env.set_carry({name.removeprefix(_START): value for name, value in arrays.items() if name.startswith(_START)})
     counts = {len(arrays[name]) if arrays[name].ndim else 0 for name in needed}
     if len(counts) != 1:
         raise ValueError(f"{path} is no whole take: its arrays are of different numbers of steps: {sorted(counts)}")
-    count, first, largest = counts.pop(), None, 0.0
-    check_count(count, MOST_STEPS, "steps", path)
-    for number in range(count):
-        step = env.step({agent: arrays[f"actions/{agent}"][number] for agent in env.agents})
-        for name, value in _after(env, step).items():
-            wanted = arrays[name][number]
-            if wanted.shape != value.shape:
-                raise ValueError(f"{path} is no whole take: {name} has the shape {wanted.shape}, not {value.shape}")
-            if not np.array_equal(wanted, value, equal_nan=True):
-                first = number if first is None else first
-                if name in ("qpos", "objects"):
-                    largest = max(largest, float(np.max(np.abs(wanted - value), initial=0.0)))
-    env.close()
-    return Replayed(count, first, largest, changed_versions(about["versions"]))
+    steps = counts.pop()
+    check_count(steps, MOST_STEPS, "steps", path)
+    return OpenTake(settings, env, about, arrays, steps)
+
+
+def start_of(arrays: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Return all that the first step of a take depends on, as `BatchedEnv.carry` does."""
+    return {name.removeprefix(_START): value for name, value in arrays.items() if name.startswith(_START)}
 
 
 def read_take(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import io
 import itertools
 import os
@@ -77,30 +78,60 @@ def _write_webp(path: Path, shape: tuple[int, ...], frames: Frames, fps: float) 
 
 
 def _write_mp4(path: Path, shape: tuple[int, ...], frames: Frames, fps: float, small: bool) -> None:
-    import imageio_ffmpeg
-
-    # Not by imageio's own writer: it forks with a Python hook, which threads of JAX may deadlock.
-    source = f"-f rawvideo -pix_fmt rgb24 -s {shape[1]}x{shape[0]} -r {fps:g} -i -"
-    even = "-vf pad=ceil(iw/2)*2:ceil(ih/2)*2"
     effort = "-preset veryslow -crf 23" if small else "-crf 20"
-    target = f"{even} -c:v libx264 {effort} -pix_fmt yuv420p -movflags +faststart"
-    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-y", "-loglevel", "error", *source.split()]
-    with subprocess.Popen(
-        [*command, *target.split(), str(path)],
-        stdin=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        start_new_session=True,  # in a session of its own, so that ffmpeg finishes its file after Ctrl-C
-    ) as ffmpeg:
-        assert ffmpeg.stdin and ffmpeg.stderr
-        try:
-            for frame in frames:
-                ffmpeg.stdin.write(np.ascontiguousarray(frame).data)
-            ffmpeg.stdin.close()
-        except BrokenPipeError:
-            pass  # ffmpeg failed; its message is shown below
-        except BaseException:
-            ffmpeg.kill()
-            raise
-        complaint = ffmpeg.stderr.read().decode(errors="replace")
-    if ffmpeg.returncode:
-        raise OSError(f"ffmpeg could not write {str(path)!r}: {' '.join(complaint.split())}")
+    with Mp4(path, shape, fps, f"{effort} -movflags +faststart") as film:
+        for frame in frames:
+            film.add(frame)
+
+
+class Mp4:
+    """An mp4 of H.264 that is written frame by frame: `with Mp4(...) as film: film.add(frame)`.
+
+    It is complete after the block. An exception in the block ends the encoder, and leaves a part of a file.
+
+    Args:
+        path: of the file.
+        shape: of a frame, [height, width, 3]. A side of an odd number of pixels gets one more.
+        fps: frames a second.
+        options: of ffmpeg for its encoder libx264.
+
+    Raises:
+        OSError: ffmpeg could not write it; raised by the end of the block.
+    """
+
+    def __init__(self, path: Path, shape: tuple[int, ...], fps: float, options: str) -> None:
+        import imageio_ffmpeg
+
+        # Not by imageio's own writer: it forks with a Python hook, which threads of JAX may deadlock.
+        source = f"-f rawvideo -pix_fmt rgb24 -s {shape[1]}x{shape[0]} -r {fps:g} -i -"
+        even = "-vf pad=ceil(iw/2)*2:ceil(ih/2)*2"
+        target = f"{even} -c:v libx264 {options} -pix_fmt yuv420p"
+        command = [imageio_ffmpeg.get_ffmpeg_exe(), "-y", "-loglevel", "error", *source.split(), *target.split()]
+        self._path = path
+        self._ffmpeg = subprocess.Popen(
+            [*command, str(path)],
+            stdin=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            start_new_session=True,  # in a session of its own, so that ffmpeg finishes its file after Ctrl-C
+        )
+
+    def add(self, frame: NDArray[np.uint8]) -> None:
+        """Write a frame [height, width, 3]."""
+        assert self._ffmpeg.stdin
+        with contextlib.suppress(BrokenPipeError):  # ffmpeg failed; its message is shown at the end
+            self._ffmpeg.stdin.write(np.ascontiguousarray(frame).data)
+
+    def __enter__(self) -> Mp4:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: object) -> None:
+        with self._ffmpeg as ffmpeg:
+            if kind is not None:
+                ffmpeg.kill()
+                return
+            assert ffmpeg.stdin and ffmpeg.stderr
+            with contextlib.suppress(BrokenPipeError):
+                ffmpeg.stdin.close()
+            complaint = ffmpeg.stderr.read().decode(errors="replace")
+        if ffmpeg.returncode:
+            raise OSError(f"ffmpeg could not write {str(self._path)!r}: {' '.join(complaint.split())}")

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import numbers
 import sys
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -35,7 +36,7 @@ BACKGROUND = (0.05, 0.02, 0.02)
 
 @dataclass(frozen=True)
 class View:
-    """The pictures of the endoscopes of N environments.
+    """The pictures of the cameras of N environments.
 
     The arrays are of the library (numpy or torch) whose array `render` was given. In their shapes, E is the number of
     eyes, H of rows and W of columns. A channel that was not asked for is None.
@@ -50,38 +51,35 @@ class View:
     owner."""
 
 
-class Endoscope:
-    """The camera of one agent, in N copies of its scene.
+class SceneCameras:
+    """Cameras of a scene's model, in N copies of the scene.
 
     Only visual geoms (groups 0 to 2) are drawn, as in all pictures. A pixel takes 3 bytes of colour, 4 of depth and 4
     of segmentation: 64 x 64 pixels in all channels take 44 KiB per eye.
 
     Args:
-        scene: a scene of which an arm has a `camera`.
+        scene: what is drawn.
+        cameras: names of cameras of `scene.model` with one field of view, from top to bottom. Each is an eye.
         num_envs: N.
         device: "cpu" or "cuda".
         width: of a picture, pixels.
-        height: likewise. The field of view is the arm's, from top to bottom.
-        stereo: both eyes; else the left one.
+        height: likewise.
         channels: what to draw, of `CHANNELS`.
-        agent: whose camera; None for the first agent that has one.
 
     Raises:
-        ValueError: a scene without an endoscope, an agent without one, a size or number below 1, an unknown channel,
-            or a device that is not there.
+        ValueError: a size or number below 1, an unknown channel, or a device that is not there.
     """
 
     def __init__(
         self,
         scene: Scene,
+        cameras: Sequence[str],
         num_envs: int = 1,
         device: str = "cpu",
         *,
         width: int = SIZE,
         height: int = SIZE,
-        stereo: bool = False,
         channels: tuple[str, ...] = ("rgb",),
-        agent: str | None = None,
     ) -> None:
         for name, value in (("num_envs", num_envs), ("width", width), ("height", height)):
             if isinstance(value, bool) or not isinstance(value, numbers.Integral) or value < 1:
@@ -92,18 +90,16 @@ class Endoscope:
         if device not in ("cpu", "cuda") or (device == "cuda" and not has_cuda()):
             raise ValueError(f"device {device!r} is not there: the devices are cpu, and cuda where torch finds it")
         self.scene, self.num_envs, self.device, self.channels = scene, num_envs, device, tuple(channels)
-        self.agent = scene.find_camera(agent)
-        self.eyes = EYES if stereo else EYES[:1]
         self.labels, self.label_names = _labels(scene)
-        self._shape = num_envs, len(self.eyes), height, width
+        self._shape = num_envs, len(cameras), height, width
         self._warp = prepare_warp()
         from surgical_marl.vision.kinematics import Kinematics
         from surgical_marl.vision.raycaster import RayCaster
 
-        cameras = [scene.model.camera(f"{self.agent}/{eye}").id for eye in self.eyes]
+        ids = [scene.model.camera(camera).id for camera in cameras]
         with self._warp.ScopedDevice(device):
             self._kinematics = Kinematics(scene.model, num_envs)
-            self._caster = RayCaster(scene.model, cameras, num_envs, width, height, BACKGROUND)
+            self._caster = RayCaster(scene.model, ids, num_envs, width, height, BACKGROUND)
         own, count = self._kinematics, scene.model.nmocap
         self._shapes = {
             "qpos": (num_envs, scene.model.nq),
@@ -117,7 +113,7 @@ class Endoscope:
         self._warp.synchronize_device(device)  # the arrays were made on Warp's own stream
 
     def render(self, qpos: Any, objects: Poses | None = None) -> View:
-        """Draw the pictures of the endoscopes at joint positions [N, nq] of the whole scene.
+        """Draw the pictures of the cameras at joint positions [N, nq] of the whole scene.
 
         Free objects are where `objects` says, as `BatchedEnv.drawn_poses` does, in arrays of the same library as
         `qpos`; without it they are where the scene places them.
@@ -177,6 +173,41 @@ class Endoscope:
         # No work is left on Warp's own stream, and waiting for it would break a capture.
         stream = self._warp.stream_from_torch(torch.cuda.current_stream())
         return self._warp.ScopedStream(stream, sync_enter=False)
+
+
+class Endoscope(SceneCameras):
+    """The camera of one agent, in N copies of its scene.
+
+    Args:
+        scene: a scene of which an arm has a `camera`.
+        num_envs: N.
+        device: "cpu" or "cuda".
+        width: of a picture, pixels.
+        height: likewise. The field of view is the arm's, from top to bottom.
+        stereo: both eyes; else the left one.
+        channels: what to draw, of `CHANNELS`.
+        agent: whose camera; None for the first agent that has one.
+
+    Raises:
+        ValueError: a scene without an endoscope, an agent without one, or as `SceneCameras`.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        num_envs: int = 1,
+        device: str = "cpu",
+        *,
+        width: int = SIZE,
+        height: int = SIZE,
+        stereo: bool = False,
+        channels: tuple[str, ...] = ("rgb",),
+        agent: str | None = None,
+    ) -> None:
+        self.agent = scene.find_camera(agent)
+        self.eyes = EYES if stereo else EYES[:1]
+        cameras = [f"{self.agent}/{eye}" for eye in self.eyes]
+        super().__init__(scene, cameras, num_envs, device, width=width, height=height, channels=channels)
 
 
 def _is_tensor(values: Any) -> bool:

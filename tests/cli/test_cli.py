@@ -64,7 +64,7 @@ TRAIN = ["train", "reach", "--scene", "psm"]
         ([*TRAIN, "--num-env", "8"], ["'--num-env'"]),
         ([*TRAIN, "extra"], ["'extra'"]),
         ([*TRAIN, "no.such=3"], ["unknown setting"]),
-        (["export"], ["scene", "policy"]),
+        (["export"], ["episodes", "scene", "policy"]),
         (["export", "scene"], ["NAME_OR_PATH"]),
         (["export", "policy"], ["RUN", "--out"]),
         (["export", "policy", "no_such_run", "--out", "new"], ["unknown run or policy 'no_such_run'"]),

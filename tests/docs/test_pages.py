@@ -180,7 +180,7 @@ def check_command(words: list[str], is_mention: bool = False) -> None:
 
 
 BENCHES = (f"bench.{kind}.run" for kind in ("report", "learning", "solve", "face", "render", "page"))
-WORK = ("cli.doctor.report", "evaluation.export.export_policy", "report.command.report",
+WORK = ("cli.doctor.report", "data.export.open_take", "evaluation.export.export_policy", "report.command.report",
         "view.take.replay", *BENCHES)  # fmt: skip
 """Where the work of commands begins."""
 BIND = server._bind
