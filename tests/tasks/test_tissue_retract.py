@@ -159,7 +159,9 @@ def test_progress_is_rewarded_once_and_only_while_the_flap_is_held() -> None:
 def test_each_step_of_the_way_to_the_lesion_pays() -> None:
     """Also while the second tool leans towards the flap, so that it has no room yet."""
     task: Any = env().task
-    point, seen, goals, rooms = task.tables["points"][ROW], world(), [], []
+    point, seen = task.tables["points"][ROW], world()
+    goals: list[Any] = []
+    rooms: list[float] = []
     for share in np.linspace(1.0, 0.0, 20):
         pose = moved(task._touching(point[None], 0.0005), share * np.array([-0.03, 0.02, 0.05]))[0]
         pose[:3, :3] = turn_about(np.array([-1.0, 0.0, 0.0]), share) @ pose[:3, :3]
