@@ -101,8 +101,8 @@ def channels(*bites: tuple[Any, Any, bool, int]) -> ChannelView:
     entry, exit_, through, needle = (np.array(part) for part in zip(*bites, strict=True))
     place = env().task.wound.in_world  # type: ignore[attr-defined]
     there, depth = needle > -2, np.full(len(bites), 0.0025)
-    parts: Any = place(entry), place(exit_), entry, exit_, depth, 0 * depth, there, through, needle, needle * 0 - 1
-    return ChannelView(*parts)
+    ends, none = (place(entry), place(exit_), entry, exit_), 0 * depth
+    return ChannelView(*ends, depth, none, there, through, needle, needle * 0 - 1, none)  # type: ignore[arg-type]
 
 
 def world(view: Any, angle: float, best: Best, touched: bool = True, **off: Any) -> World:

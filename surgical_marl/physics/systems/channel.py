@@ -258,8 +258,9 @@ class Channels:
         entry, exit_, entry_at_rest, exit_at_rest, depth = jax.lax.map(one, (state.places, state.total))
         there = state.total > 0
         swept, through = jnp.where(there, state.swept, 0.0), state.through & there
+        drawn = jnp.where(there, jnp.maximum(state.along[:, 0], 0.0), 0.0)
         return ChannelView(
-            entry, exit_, entry_at_rest, exit_at_rest, depth, swept, there, through, state.needle, state.thread
+            entry, exit_, entry_at_rest, exit_at_rest, depth, swept, there, through, state.needle, state.thread, drawn
         )
 
     def _at_rest(self, at: Array) -> Array:

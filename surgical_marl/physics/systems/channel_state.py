@@ -82,6 +82,8 @@ class ChannelView(NamedTuple):
     """Number of the needle that is in each, [c]; -1 for none."""
     thread: Array
     """Number of the needle whose thread is in each, [c]; -1 for none."""
+    drawn: Array
+    """Length of that thread that has gone in at the entry, m, [c]."""
 
 
 def hold(end: End, moved: Array) -> Felt:
