@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -24,8 +25,8 @@ LEAN = np.radians(20.0)
 """Angle by which the axis of the needle's turn points down: a tool that pointed along the tissue would lie on it."""
 BEFORE, BEYOND = np.radians(25.0), np.radians(30.0)
 """Angles of the needle's turn before the tip is at the entry, from where the oracle drives it, and past the exit."""
-BACK = 0.003
-"""Length of the needle between its tail and the middle of the jaw, m; it varies by a third."""
+BACK = 0.002, 0.004
+"""Least and greatest length of the needle between its tail and the middle of the jaw, m."""
 PRESS = 0.0019
 """Distance by which a tool tip is past the wire that it grips, m."""
 TILT = 0.1
@@ -81,10 +82,11 @@ class Wound(NamedTuple):
     """Unit vector from the first edge to the second one, in the tissue's frame, [3]."""
 
     @classmethod
-    def seen_from(cls, tissue: Any, place: np.ndarray) -> Wound:
+    def seen_from(cls, tissue: Any, place: np.ndarray, lean: float) -> Wound:
         """Return the wound in tissue whose bricks leave a slit along x, for an arm at a place [3] in the world, m.
 
-        The arm's tool points along the slit away from there, so that it stays above the tissue.
+        The arm's tool points along the slit away from there, and down by an angle `lean`, rad, so that it stays above
+        the tissue.
         """
         present, size = np.array(tissue.present), np.array(tissue.size)
         gap, cell = np.argwhere(~present), size / present.shape
@@ -93,7 +95,7 @@ class Wound(NamedTuple):
         axes = np.array(tissue.rotation)
         away = axes @ middle + np.array(tissue.position) - place
         along, up = axes[:, 0] * (1.0 if axes[:, 0] @ away >= 0 else -1.0), axes[:, 2]
-        pointing = np.cos(LEAN) * along - np.sin(LEAN) * up
+        pointing = np.cos(lean) * along - np.sin(lean) * up
         return cls(tissue, middle, float(high[1] - low[1]) / 2, pointing, np.cross(up, along) @ axes)
 
     def in_world(self, rest: np.ndarray) -> np.ndarray:
@@ -102,7 +104,9 @@ class Wound(NamedTuple):
 
 
 def draw_starts(
-    scene: Scene, agent: str, item: str, needle: Needle, wound: Wound, rows: int, seed: int, edges: int, picks: bool
+    scene: Scene, agent: str, item: str, needle: Needle, wound: Wound, rows: int, seed: int, edges: int, picks: bool,
+    beyond: float = BEYOND, back: tuple[float, float] = BACK, away: float = 1.0,
+    also: Callable[[np.ndarray, np.ndarray], np.ndarray] | None = None,
 ) -> np.ndarray:  # fmt: skip
     """Return starts of an arm that can make the whole way of a needle, a table for `Starts.of`, [rows, k].
 
@@ -116,6 +120,11 @@ def draw_starts(
         seed: of the draws.
         edges: that it goes through: 1 for the first edge alone, up to the wall of the slit, or 2.
         picks: True if the needle lies on its pad, and the arm is at home.
+        beyond: angle by which the needle is turned on past the exit, rad.
+        back: least and greatest length of the needle between its tail and the middle of the jaw, m.
+        away: share of the greatest distance and turn at which the needle in the jaw may begin.
+        also: returns whether others can do their part, [n] bool, of poses of needles at the entry, [n, 4, 4], and the
+            angles of their turns to the exit, [n].
     """
     mount, rng = scene.mounts[agent], np.random.default_rng(seed)
 
@@ -128,19 +137,20 @@ def draw_starts(
         wall = wound.in_world(wound.middle - wound.width * wound.across if edges == 1 else wound.middle)
         sweep, tips = reaching(needle, entries, wall, normal)
         marks[:, 1] = (tips - np.array(wound.tissue.position)) @ turn
-        behind = needle.length - BACK * rng.uniform(2 / 3, 4 / 3, rows)
+        behind = needle.length - rng.uniform(*back, rows)
         lean = np.zeros(rows) if picks else rng.uniform(-TILT, TILT, rows)
         held = held_at(needle, behind, lean, PRESS)
         tools = driven(needle, entries, sweep / 2) @ held
         turned_over = tools[:, :3, 0] @ tool_of(mount, mount.arm.home)[:3, 0] < 0  # which the roll would have to make
         held[:, :3, :2] *= np.where(turned_over, -1.0, 1.0)[:, None, None]
-        starts = _lying(scene, item, needle, rows, rng) if picks else _in_jaw(needle, entries, rng)
+        starts = _lying(scene, item, needle, rows, rng) if picks else _in_jaw(needle, entries, rng, away)
         first, good = joints_at(mount, starts @ held)
         q = first
         for share in SHARES:
-            angle = share * (sweep + BEYOND + BEFORE) - BEFORE
+            angle = share * (sweep + beyond + BEFORE) - BEFORE
             q, reached = joints_at(mount, driven(needle, entries, angle) @ held, q)
             good &= reached
+        good &= also(entries, sweep) if also else True
         posture = np.where(mount.arm.moves_jaw, OPEN, first)
         posture = np.tile(mount.arm.home, (rows, 1)) if picks else posture
         found = Starts(_flat(starts), _flat(entries), _flat(held), marks, sweep, posture)
@@ -158,12 +168,13 @@ def _marks(wound: Wound, rows: int, rng: np.random.Generator) -> np.ndarray:
     return np.asarray(middle + np.array([[-1.0], [1.0]]) * bite * wound.across + skew * along)
 
 
-def _in_jaw(needle: Needle, entries: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Return poses [n, 4, 4] of the needle above the entry."""
+def _in_jaw(needle: Needle, entries: np.ndarray, rng: np.random.Generator, away: float) -> np.ndarray:
+    """Return poses [n, 4, 4] of the needle above the entry, or at it if `away` is 0."""
     starts = driven(needle, entries, -BEFORE)
-    turns = np.array([turned(degrees) for degrees in rng.uniform(-TURNED, TURNED, (len(entries), 3))])
+    turns = np.array([turned(away * degrees) for degrees in rng.uniform(-TURNED, TURNED, (len(entries), 3))])
     starts[:, :3, :3] = turns @ starts[:, :3, :3]
-    return moved(starts, rng.uniform([-BESIDE, -BESIDE, HIGH[0]], [BESIDE, BESIDE, HIGH[1]], (len(entries), 3)))
+    ways = rng.uniform([-BESIDE, -BESIDE, HIGH[0]], [BESIDE, BESIDE, HIGH[1]], (len(entries), 3))
+    return moved(starts, away * ways)
 
 
 def _lying(scene: Scene, item: str, needle: Needle, rows: int, rng: np.random.Generator) -> np.ndarray:

@@ -28,7 +28,7 @@ Difficulty    easy: through the first edge alone: the exit is on the wall of the
 from __future__ import annotations
 
 from functools import partial
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import numpy as np
 
@@ -44,11 +44,12 @@ from surgical_marl.tasks.base.task import Start
 from surgical_marl.tasks.base.task import Task as Base
 from surgical_marl.tasks.base.terms import Picture, Term
 from surgical_marl.tasks.needle_drive.path import driven
-from surgical_marl.tasks.needle_drive.starts import BEFORE, BEYOND, Starts, Wound, draw_starts
+from surgical_marl.tasks.needle_drive.starts import BEFORE, BEYOND, LEAN, Starts, Wound, draw_starts
 
 if TYPE_CHECKING:
     from jax import Array
 
+    from surgical_marl.physics.systems.channel_state import ChannelView
     from surgical_marl.scenes.scene import Scene
     from surgical_marl.tasks.base.options import Options
     from surgical_marl.tasks.base.world import World
@@ -154,6 +155,10 @@ class Task(Base):
     scenes = ("psm_suture", "bimanual_psm_suture")
     stages = ("at_entry", "entered", "first_edge", "exited", "driven")
     wanted = {"success_rate": ("at least", 0.95), "drop_rate": ("below", 0.02)}  # noqa: RUF012
+    lean: ClassVar[float] = LEAN
+    """Angle by which the axis of the needle's turn points down, rad."""
+    beyond: ClassVar[float] = BEYOND
+    """Angle by which the needle is turned on past the exit, rad."""
 
     def __init__(self, scene: Scene, options: Options) -> None:
         super().__init__(scene, options)
@@ -170,18 +175,22 @@ class Task(Base):
         sites, middles = self._item.sites, bars(self._item)[0]
         self._middles = middles.astype(np.float32)
         self._three = np.stack([sites["tip"][0], middles[len(middles) // 2], sites["tail"][0]]).astype(np.float32)
-        self.wound = Wound.seen_from(self._system, scene.mounts[self.driver].position)
+        self.wound = Wound.seen_from(self._system, scene.mounts[self.driver].position, self.lean)
         self._set_tables(self._drawn(scene))
 
     def _drawn(self, scene: Scene) -> Starts:
         """Return the starts, which are kept on disk."""
-
-        def draw() -> np.ndarray:
-            level = self.level.edges, self.level.picks
-            return draw_starts(scene, self.driver, self.object, self.needle, self.wound, ROWS, self.seed, *level)
-
         about = repr((self.object, self.driver, self.level, self.seed, self._system))
-        return Starts.of(cached("needle_drive", draw, about, scene.fingerprint, self._item.content))
+        return Starts.of(
+            cached("needle_drive", lambda: self._draw(scene), about, scene.fingerprint, self._item.content)
+        )
+
+    def _draw(self, scene: Scene, **more: Any) -> np.ndarray:
+        """Return starts, a table for `Starts.of`; `more` as of `draw_starts`."""
+        level = self.level.edges, self.level.picks
+        return draw_starts(
+            scene, self.driver, self.object, self.needle, self.wound, ROWS, self.seed, *level, self.beyond, **more
+        )
 
     def _find_tissue(self, scene: Scene, options: Options) -> tuple[str, Any]:
         """Return the name of the first tissue that needles go through, and the tissue; ValueError if there is none."""
@@ -258,7 +267,7 @@ class Task(Base):
             return jnp.sqrt(jnp.sum(way * way, -1))
 
         rest = self.tables["marks"][row]
-        mine = channels.there & (channels.needle == self._mine)
+        mine, in_tissue = self.bites(channels), channels.there & (channels.needle == self._mine)
         ends = mine & channels.through
         off_in = jnp.where(mine, length(channels.entry_at_rest - rest[0]), FAR)
         off_out = jnp.where(ends, length(channels.exit_at_rest - rest[1]), FAR)
@@ -270,7 +279,7 @@ class Task(Base):
         handled = arm.handles[self.object]
         touched = jnp.stack([view.handles[self.object].force > 0 for view in world.arms.values()]).any()
         lowest = jnp.min(place(self._three)[:, 2]) - self.tables["lowest"][row]
-        dropped = ((world.goal.best.lift >= 1.0) & ~touched & ~entered) | ~(lowest >= -self._deepest)
+        dropped = ((world.goal.best.lift >= 1.0) & ~touched & ~in_tissue.any()) | ~(lowest >= -self._deepest)
         tool = self.scene.mounts[self.driver]
         tip = arm.tool_tip @ tool.rotation.T.astype(np.float32) + tool.position.astype(np.float32)
         return Now(
@@ -289,6 +298,10 @@ class Task(Base):
             out=out,
             dropped=dropped,
         )
+
+    def bites(self, channels: ChannelView) -> Array:
+        """Return which channels count as bites of the needle, [c] bool: those that it is in."""
+        return channels.there & (channels.needle == self._mine)
 
     @property
     def _deepest(self) -> float:
@@ -363,7 +376,7 @@ class Task(Base):
     def metrics(self, world: World) -> dict[str, dict[str, Array]]:
         """Return `entry_error`, `exit_error`, `bite_depth` and `swept`, m, and `drop`."""
         now, channels = self.now(world), world.systems[self.tissue].channels
-        mine = channels.there & (channels.needle == self._mine)
+        mine = self.bites(channels)
         found = {
             "entry_error": now.entry,
             "exit_error": now.exit,
@@ -458,7 +471,7 @@ class Task(Base):
 
         def turn(seen: Snapshot, angle: float | None) -> dict[str, Wish]:
             row = seen.goal.row
-            angles = self.sweep[row] + BEYOND
+            angles = self.sweep[row] + self.beyond
             angles = angles if angle is None else np.minimum(angle, angles)
             held = np.linalg.inv(seen.objects[self.object]) @ seen.tools[agent]
             return {agent: Wish(driven(needle, self.entries[row], angles) @ held)}
@@ -478,7 +491,7 @@ class Task(Base):
                 lambda seen: {agent: Wish(moved(seen.tools[agent], [0.0, 0.0, RAISE]))}, wait=0.1, pace=0.3, good=holds
             ),
         )
-        most = float(self.sweep.max()) + BEYOND
+        most = float(self.sweep.max()) + self.beyond
         angles = np.arange(-BEFORE, most, TURN)
         drives = [Step(partial(turn, angle=float(angle)), pace=0.4) for angle in angles[1:]]
         return (
