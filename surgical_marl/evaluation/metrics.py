@@ -43,8 +43,10 @@ BITES = {
     "entry_error": ("entry_error_mm", 1000.0),
     "exit_error": ("exit_error_mm", 1000.0),
     "bite_depth": ("bite_depth_mm", 1000.0),
+    "tail_error": ("tail_error_mm", 1000.0),
+    "gap": ("gap_mm", 1000.0),
 }
-"""Infos of a needle in tissue whose value after the last step counts, likewise; of all episodes, their median."""
+"""Infos of a needle or a stitch whose value after the last step counts, likewise; of all episodes, their median."""
 PEAK = {
     "contact_force": ("peak_force_n", 1.0),
     "tissue_force": ("max_tissue_force_n", 1.0),

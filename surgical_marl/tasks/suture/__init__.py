@@ -1,0 +1,1 @@
+from surgical_marl.tasks.suture.task import Task as Task
