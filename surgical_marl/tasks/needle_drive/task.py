@@ -152,8 +152,8 @@ class Task(Base):
         "success": 0.5, "force": -0.1, "drop": -2.0, "clearance": -1.0, "collision": -2.0,
     }  # fmt: skip
     default_scene = "psm_suture"
-    scenes = ("psm_suture", "bimanual_psm_suture")
-    stages = ("at_entry", "entered", "first_edge", "exited", "driven")
+    scenes: ClassVar[tuple[str, ...]] = ("psm_suture", "bimanual_psm_suture")
+    stages: ClassVar[tuple[str, ...]] = ("at_entry", "entered", "first_edge", "exited", "driven")
     wanted = {"success_rate": ("at least", 0.95), "drop_rate": ("below", 0.02)}  # noqa: RUF012
     lean: ClassVar[float] = LEAN
     """Angle by which the axis of the needle's turn points down, rad."""

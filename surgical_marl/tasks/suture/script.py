@@ -32,7 +32,7 @@ HALFWAY, END = np.radians(70.0), np.radians(186.0)
 TURN = np.radians(10.0)
 """Angle by which the partner turns the needle at a time."""
 APART, AWAY, CLEAR = 0.008, 0.02, 0.03
-"""Distances from which a tool comes, to which it leaves, and by which the driver moves aside and up, m."""
+"""Distances from which a tool comes, to which it leaves, and by which it keeps above while it turns to come, m."""
 SHALLOW = 0.0005
 """Distance by which the partner's tool tip is past the wire near the exit, m: further, it would press on the tissue."""
 WIDE = 0.5
@@ -119,12 +119,13 @@ class Stitcher(NamedTuple):
             row = seen.goal.row
             return self.turned(seen.objects[self.item], task.entries[row]) - task.sweep[row]
 
-        def comes(agent: str, tool: np.ndarray, back: float) -> dict[str, Wish]:
-            """Bring a tool this far back from a grip; first with the roll that is nearest to home, or it winds up."""
-            return {agent: Wish(moved(tool, -back * tool[:, :3, 2]), opens=WIDE, from_home=back > 0)}
+        def comes(agent: str, tool: np.ndarray, back: float, above: float) -> dict[str, Wish]:
+            """Bring a tool this far back from a grip and above it; above with a roll near home, or it winds up."""
+            there = moved(tool, -back * tool[:, :3, 2] + [0.0, 0.0, above])
+            return {agent: Wish(there, opens=WIDE, from_home=above > 0)}
 
-        def take(seen: Snapshot, grip: tuple[float, float], back: float) -> dict[str, Wish]:
-            return comes(partner, self.taken(seen.objects[self.item], *grip), back)
+        def take(seen: Snapshot, grip: tuple[float, float], *off: float) -> dict[str, Wish]:
+            return comes(partner, self.taken(seen.objects[self.item], *grip), *off)
 
         def turn(seen: Snapshot, to: float) -> dict[str, Wish]:
             """Turn needles on about the centres of the arcs along which they were driven."""
@@ -136,9 +137,9 @@ class Stitcher(NamedTuple):
             left = np.clip(self._left(task, seen), 0.0, PULL)
             return {partner: Wish(moved(seen.tools[partner], left[:, None] * UP))}
 
-        def receive(seen: Snapshot, back: float) -> dict[str, Wish]:
+        def receive(seen: Snapshot, *off: float) -> dict[str, Wish]:
             tool = self._least_roll(driver, seen.objects[self.item] @ task.held[seen.goal.row])
-            return comes(driver, tool, back)
+            return comes(driver, tool, *off)
 
         def leave(seen: Snapshot, agent: str, off: bool) -> dict[str, Wish]:
             """Draw a tool back, or off the needle's tip: the first grip's tool points up as it is done, from below."""
@@ -155,12 +156,13 @@ class Stitcher(NamedTuple):
 
         steps: list[Step] = []
 
-        def grips(agent: str, plan: Callable[[Snapshot, float], dict[str, Wish]]) -> None:
+        def grips(agent: str, plan: Callable[[Snapshot, float, float], dict[str, Wish]]) -> None:
             """Add the steps in which an arm comes to the needle and grips it, again if it misses."""
             back = number + len(steps)
             steps.extend([
-                Step(lambda seen: plan(seen, APART), wait=0.1),
-                Step(lambda seen: plan(seen, 0.0), wait=SETTLE, pace=0.3),
+                Step(lambda seen: plan(seen, APART, CLEAR)),
+                Step(lambda seen: plan(seen, APART, 0.0), wait=0.1, pace=0.5),
+                Step(lambda seen: plan(seen, 0.0, 0.0), wait=SETTLE, pace=0.3),
                 Step(lambda seen: {agent: Wish()}, wait=0.4, pace=0.3, good=holds(agent), back=back),
             ])  # fmt: skip
 
@@ -176,12 +178,12 @@ class Stitcher(NamedTuple):
                 Step(lambda seen: turn(seen, to), pace=0.4, good=lambda seen: past(seen) > to - TURN / 2, back=here)
             )
 
-        grips(partner, lambda seen, back: take(seen, FIRST, back))
+        grips(partner, lambda seen, *off: take(seen, FIRST, *off))
         opens(driver)
         steps.append(Step(aside))
         turns(HALFWAY)
         opens(partner, off=True)
-        grips(partner, lambda seen, back: take(seen, SECOND, back))
+        grips(partner, lambda seen, *off: take(seen, SECOND, *off))
         turns(END)
         if not task.whole:
             return (*steps, Step(lambda seen: {}, wait=0.1))
