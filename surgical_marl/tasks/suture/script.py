@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from surgical_marl.physics.systems.needle import Needle
     from surgical_marl.scenes.scene import Scene
 
-FIRST, SECOND = (np.radians(45.0), 0.0015), (np.radians(-45.0), 0.0020)
+FIRST, SECOND = (np.radians(45.0), 0.0012), (np.radians(-45.0), 0.0020)
 """Angles by which the partner's tool leans outwards, and lengths of the needle between its tip and the places that are
 gripped, m, near the exit and where the needle stands out."""
 HALFWAY, END = np.radians(70.0), np.radians(186.0)
@@ -35,7 +35,7 @@ APART, AWAY, CLEAR = 0.008, 0.02, 0.03
 """Distances from which a tool comes, to which it leaves, and by which it keeps above while it turns to come, m."""
 SHALLOW = 0.0005
 """Distance by which the partner's tool tip is past the wire near the exit, m: further, it would press on the tissue."""
-WIDE = 0.5
+WIDE = 0.4
 """Opening of a jaw that comes to the needle or leaves it, as a share of its way."""
 UP = np.array([0.0, 0.2, 0.98])
 """Direction in which the thread is pulled."""
