@@ -23,7 +23,8 @@ _FORMATS = {
     "log": "LOG({})", "tan": "TAN({})", "acos": "ACOS({})", "asin": "ASIN({})", "atan2": "ATAN2({},{})",
     "tanh": "TANH({})", "max": "MAX{K}({},{})", "min": "MIN{K}({},{})", "isfinite": "FINITE({})", "f2i": "F2I({})",
     "i2f": "I2F({})", "u2f": "U2F({})", "f2u": "F2U({})", "i2u": "I2U({})", "u2i": "U2I({})", "bits": "BITS({})",
-    "float": "FLOAT({})", "select": "SELECT({},{},{})", "load": "LD{K}({},{})", "table": "TABLE{K}({},{})",
+    "float": "FLOAT({})", "select": "SELECT({},{},{})", "load": "LD{K}({},{})",
+    "fields": "LD{K}({},{}+({})*k)", "table": "TABLE{K}({},{})",
     "row": "ROW{K}({},{})", "splat": "SPLATI({})",
 }  # fmt: skip
 _WRAPPING = {"add", "sub", "mul", "neg", "shl"}
@@ -47,14 +48,15 @@ class CPrinter:
                 return f"{TYPES[kind]} {name}={text(value)};" if value is not None else self._undefined(name, kind)
             case ir.Assign(target, value, keep):
                 return f"{text(target)}={self._kept(target, value, keep)};"
-            case ir.Repeat(rounds, assign):
-                return f"for(int k=0;k<{rounds};++k){self.line(assign)}"
+            case ir.Repeat(rounds, repeated):
+                return f"for(int k=0;k<{rounds};++k){self.line(repeated)}"
             case ir.Declare(name, kind, size, aligned):
                 return f"{'ALIGNED ' if aligned else ''}{TYPES[kind]} {name}[{size}];"
             case ir.Scatter(target, value):
                 return f"SCATTER_ARRAY({TYPES[target.kind]},{target.array},{self._within(target)},{text(value)})"
-            case ir.Store(buffer, field, kind, value):
-                return f"ST{kind.upper()}({buffer},{field},{text(value)});"
+            case ir.Store(buffer, field, kind, value, stride):
+                place = f"{field}+({stride})*k" if stride else field
+                return f"ST{kind.upper()}({buffer},{place},{text(value)});"
             case ir.If(condition):
                 return f"if(ANY({text(condition)})){{"
             case ir.Else(condition):

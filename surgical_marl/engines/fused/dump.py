@@ -75,7 +75,7 @@ class _Text:
     def _node(self, node: Value) -> str:
         g, op = self.graph, self.graph.ops[node]
         args = g.args[node]
-        raw = len(args) if op == "load" else 1 if op == "lookup" else 0  # fields and tables are no values
+        raw = len(args) if op in ("load", "fields") else 1 if op == "lookup" else 0  # fields and tables are no values
         return " ".join([op, g.kinds[node], *map(str, args[:raw]), *map(self._name, args[raw:])])
 
     def _name(self, value: Any) -> str:

@@ -21,6 +21,8 @@ import numpy as np
 from surgical_marl.engines.fused.operations import COMMUTATIVE, DTYPES, FOLD, KIND_OF, RESULT, combined_bounds
 
 Value = int
+LEAST_ROW = 32
+"""Fields of a buffer, in a row, that a loop moves to or from an array; fewer are moved one by one."""
 
 
 @dataclass
@@ -144,7 +146,7 @@ class Graph:
         What a group reads is not counted for the nodes that stand for its values, but for the group.
         """
         op, args = self.ops[value], self.args[value]
-        if op in ("load", "phi", "out", "counter"):
+        if op in ("load", "fields", "phi", "out", "counter"):
             return []
         return [a for a in (args[1:] if op == "lookup" else args) if a >= 0]
 
@@ -347,8 +349,18 @@ class Graph:
     # -- arrays in memory
 
     def array(self, values: list[Value]) -> Value:
-        """Return an array that holds these values."""
-        return self.node("array", *values, kind=f"{self.kind(values[0])}{len(values)}")
+        """Return an array that holds these values. Many that stand in a row in a buffer are loaded by a loop."""
+        kind, row = f"{self.kind(values[0])}{len(values)}", self._row(values)
+        return self.node("fields", *row, kind=kind) if row else self.node("array", *values, kind=kind)
+
+    def _row(self, values: list[Value]) -> tuple[str, int, int] | None:
+        """Return the buffer, the first field and the step from field to field of values that are loaded from a row."""
+        if len(values) < LEAST_ROW or any(value < 0 or self.ops[value] != "load" for value in values):
+            return None
+        (buffer, first), (_, second) = self.args[values[0]], self.args[values[1]]
+        step = second - first
+        row = all(self.args[value] == (buffer, first + step * k) for k, value in enumerate(values))
+        return (buffer, first, step) if row else None
 
     def update(self, array: Value, index: Value, values: list[Value]) -> Value:
         """Return an array that holds `values` from `index` on; the index must be in range."""
@@ -358,6 +370,9 @@ class Graph:
         """`array[index]`; the index must be in range."""
         if index < 0 and self.ops[array] == "array":
             return int(self.args[array][int(self.constants[~index])])
+        if index < 0 and self.ops[array] == "fields":
+            buffer, first, step = self.args[array]
+            return self.node("load", buffer, first + step * int(self.constants[~index]), kind=self.kinds[array][0])
         return self.node("read", array, index, kind=self.kinds[array][0])
 
     def bounds(self, value: Value) -> tuple[int, int] | None:

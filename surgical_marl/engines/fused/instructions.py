@@ -23,6 +23,8 @@ from typing import Any, NamedTuple, Union
 
 import numpy as np
 
+from surgical_marl.engines.fused.graph import LEAST_ROW
+
 Operand = Union[str, int, np.generic, "Element", "Gather", "Call"]
 
 
@@ -51,7 +53,7 @@ class Gather(NamedTuple):
 
 
 class Call(NamedTuple):
-    """An operation of the graph, or "load", "table", "row", "splat", "all": see `c_printer.py`."""
+    """An operation of the graph, or "load", "fields", "table", "row", "splat", "all": see `c_printer.py`."""
 
     op: str
     kind: str
@@ -83,13 +85,6 @@ class Assign(NamedTuple):
     keep: Operand | None = None
 
 
-class Repeat(NamedTuple):
-    """Do an assignment for k = 0 ... rounds - 1."""
-
-    rounds: int
-    assign: Assign
-
-
 class Scatter(NamedTuple):
     """Store a vector, each lane at its own index."""
 
@@ -98,12 +93,13 @@ class Scatter(NamedTuple):
 
 
 class Store(NamedTuple):
-    """Store to a field of a buffer of the environments."""
+    """Store to a field of a buffer of the environments: `field + stride * k` in a `Repeat`."""
 
     buffer: str
     field: int
     kind: str
     value: Operand
+    stride: int = 0
 
 
 class Size(NamedTuple):
@@ -185,6 +181,13 @@ class CheckFinite(NamedTuple):
     value: Operand
 
 
+class Repeat(NamedTuple):
+    """Do an instruction for k = 0 ... rounds - 1."""
+
+    rounds: int
+    one: Assign | Store | CheckFinite
+
+
 class ReportFinite(NamedTuple):
     """Set a field of `flags` if some value was not finite."""
 
@@ -227,7 +230,7 @@ _OPERANDS = {
 def operands(one: Instruction) -> Iterator[Operand]:
     """Yield the operands of an instruction, the target of an assignment first, and not those within others."""
     if isinstance(one, Repeat):
-        one = one.assign
+        one = one.one
     for field in _OPERANDS.get(type(one), ()):
         value = getattr(one, field)
         if value is not None:
@@ -249,7 +252,7 @@ def parts(operand: Operand) -> Iterator[Operand]:
 def rewritten(one: Any, change: Rename) -> Any:
     """Return an instruction with `change` applied to all operands in it, inner ones first."""
     if isinstance(one, Repeat):
-        return Repeat(one.rounds, rewritten(one.assign, change))
+        return Repeat(one.rounds, rewritten(one.one, change))
     new = {}
     for field in _OPERANDS.get(type(one), ()):
         value = getattr(one, field)
@@ -285,6 +288,14 @@ def arrays_at_unknown_places(code: Code) -> set[str]:
         for part in parts(operand)
         if isinstance(part, Gather) or (isinstance(part, Element) and part.base is not None)
     }
+
+
+def arrays_in_memory(code: Code) -> set[str]:
+    """Return the names of arrays at unknown places, and of those that a loop of `LEAST_ROW` rounds copies."""
+    repeated = (one for one in code if isinstance(one, Repeat) and one.rounds >= LEAST_ROW)
+    elements = (part for one in repeated for operand in operands(one) for part in parts(operand))
+    rows = {part.array for part in elements if isinstance(part, Element) and part.stride}
+    return arrays_at_unknown_places(code) | rows
 
 
 def large_branches(code: Code) -> int:

@@ -36,7 +36,20 @@ def check_finite(code: ir.Code, watch: Watch) -> ir.Code:
         found.append(one)
         if isinstance(one, ir.Store) and (one.buffer, one.field) in watch.fields:
             found.append(ir.CheckFinite(one.value))
+        elif isinstance(one, ir.Repeat) and isinstance(one.one, ir.Store):
+            found += _checked_row(one.one, one.rounds, watch)
     return [*found, ir.ReportFinite(watch.flag)]
+
+
+def _checked_row(store: ir.Store, rounds: int, watch: Watch) -> ir.Code:
+    """Return the checks of what a loop stores: of an array's elements, in one loop if all are watched."""
+    watched = [(store.buffer, store.field + store.stride * k) in watch.fields for k in range(rounds)]
+    if all(watched):
+        return [ir.Repeat(rounds, ir.CheckFinite(store.value))]
+    value = store.value
+    assert isinstance(value, ir.Element)
+    offsets = (value.offset + value.stride * k for k in range(rounds) if watched[k])
+    return [ir.CheckFinite(value._replace(offset=offset, stride=0)) for offset in offsets]
 
 
 def count_work(code: ir.Code) -> ir.Code:

@@ -197,6 +197,8 @@ class Lowering(ArrayLowering):
         g, op = self.graph, self.graph.ops[value]
         if op == "array":
             self.array(value)
+        elif op == "fields":
+            self.fields(value)
         elif op == "update":
             self.update(value)
         elif op == "read" and self.is_operand(value):

@@ -104,6 +104,14 @@ class ArrayLowering:
             self.declare(f"v{value}", self.graph.kinds[value])
         self._fill(f"v{value}", (None, 0), list(self.graph.args[value]), self._stored.get(value, set()))
 
+    def fields(self, value: Value) -> None:
+        """Make an array of fields of a buffer."""
+        kind, name = self.graph.kinds[value], f"v{value}"
+        self.names[value] = name
+        self.declare(name, kind)
+        load = ir.Call("fields", kind[0], self.graph.args[value])
+        self.code.append(ir.Repeat(int(kind[1:]), ir.Assign(ir.Element(name, stride=1), load)))
+
     def update(self, value: Value) -> None:
         """Store the new elements of an updated array, in place or in a copy."""
         array, index, *values = self.graph.args[value]

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from jax import lax
 
-from surgical_marl.engines.fused import hints, instrumentation, source_cache
+from surgical_marl.engines.fused import graph, hints, instructions, instrumentation, memory_order, source_cache
 from surgical_marl.engines.fused import instructions as ir
 from surgical_marl.engines.fused.graph import Graph
 from surgical_marl.engines.fused.options import DUMP, PASSES, VERIFY
@@ -43,16 +43,18 @@ def function(x: Any, which: Any) -> Any:
 
 @pytest.fixture(autouse=True)
 def verified(monkeypatch: pytest.MonkeyPatch) -> None:
-    """All branches count as large, all code as long, and the IR is checked after each pass."""
+    """All branches count as large, all code as long, few fields as many, and the IR is checked after each pass."""
     monkeypatch.setenv(VERIFY, "1")
     monkeypatch.setattr("surgical_marl.engines.fused.macros.LONG_CODE", 0)
     monkeypatch.setattr(hints, "LARGE", 0)
+    for module in (graph, instructions, memory_order):
+        monkeypatch.setattr(module, "LEAST_ROW", 4)
     for size in ("LARGE", "LARGE_PATH"):
         monkeypatch.setattr(instrumentation, size, 0)
 
 
-def text(vector: bool) -> str:
-    graph, stores, *_ = make_stores(function, COLUMNS)
+def text(vector: bool, function: Any = function, columns: Any = COLUMNS) -> str:
+    graph, stores, *_ = make_stores(function, columns)
     return compile_program(Program(graph, stores, vector)).text
 
 
@@ -86,6 +88,27 @@ def test_code_without_any_pass_computes_the_same(monkeypatch: pytest.MonkeyPatch
     for one in found:
         for a, b in zip(one, expected, strict=True):
             np.testing.assert_allclose(a, b, rtol=1e-5)
+
+
+def test_fields_in_a_row_are_moved_by_loops() -> None:
+    """To an array that a branch changes, of which one element is read at a known place, and from it to other fields."""
+
+    def changed(rows: Any, which: Any) -> Any:
+        late = lax.cond(which % 3 > 0, lambda: rows.at[which % 6, 1].set(rows[(which + 1) % 6, 0]), lambda: rows)
+        return late, late[2, 1] - rows[3, 0]
+
+    columns = RNG.uniform(-1, 1, (9, 6, 2)).astype(np.float32), COLUMNS[1]
+    for vector in (False, True):
+        code = text(vector, changed, columns)
+        assert "LDF(state,0+(1)*k)" in code and "=LDF(state,6);" in code
+        assert len([line for line in code.splitlines() if "STF(" in line and "+(1)*k,v" in line]) == 1
+    expected = jax.jit(jax.vmap(changed))(*columns)
+    found = [run(changed, *columns)]
+    with gpu_code():
+        found.append(run(changed, *columns))
+    for one in found:
+        for a, b in zip(one, expected, strict=True):
+            np.testing.assert_allclose(a, b, rtol=1e-6)
 
 
 @pytest.mark.parametrize("word", ["interleave", "-place", "-interleaving", "-"])
