@@ -22,6 +22,7 @@ from surgical_marl.data.request import Request
 from surgical_marl.data.signals import Signals
 from surgical_marl.policies.policy import load_policy
 from surgical_marl.runs.settings import Settings, make_env
+from surgical_marl.view.session import Session
 
 SETTINGS = Settings(task="reach", scene="psm", seed=3, max_steps=12, device="cpu")
 ARM, COUNT, RATE = "psm_0", 3, 25
@@ -278,6 +279,31 @@ def test_only_success(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(exporting, "TRIES", 4)
     with pytest.raises(ValueError, match=r"^0 of 4 episodes of 'zero' succeed: choose another policy"):
         export(request("robomimic", policy="zero", only_success=True, pictures=()), tmp_path / "none")
+
+
+def test_takes_are_exported_in_any_form(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    needs("robomimic")
+    import h5py
+
+    session = Session(SETTINGS, "random", num_envs=2, record=tmp_path / "takes")
+    for _ in range(18):
+        session.step()
+    session.close()
+    take, out = str(tmp_path / "takes/take-0001.npz"), tmp_path / "set"
+    command = ["export", "episodes", take, "--format", "robomimic"]
+    assert main([*command, "--out", str(out), "--actions", "relative", "--cameras", "outside", "--size", "32x32"]) == 0
+    assert capsys.readouterr().out == f"{out}\n"
+    with h5py.File(out / "episodes.hdf5") as file:
+        assert [len(file[f"data/demo_{number}/actions"]) for number in range(4)] == [12, 12, 6, 6]
+        assert file["data/demo_3/obs/outside_image"].shape == (6, 32, 32, 3)
+        assert file["data/demo_3/actions"].shape == (6, 10)
+    assert main([*command, "--out", str(tmp_path / "two"), "--episodes", "2"]) == 0
+    assert json.loads((tmp_path / "two/export.json").read_text())["takes"].keys() == {"take-0001.npz"}
+    with h5py.File(tmp_path / "two/episodes.hdf5") as file:
+        assert len(file["data"]) == 2
+    capsys.readouterr()
+    assert main([*command, "--out", str(tmp_path / "new"), "--policy", "zero"]) == 2
+    assert "a take says itself what it is of: leave out --policy" in capsys.readouterr().err
 
 
 COMMAND = ["export", "episodes", "reach", "--scene", "psm", "--format", "robomimic", "--out", "new"]
