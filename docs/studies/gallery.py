@@ -41,9 +41,9 @@ from surgical_marl.view.drawn import Extra
 from surgical_marl.view.lighting import PLAIN
 from surgical_marl.view.render import Renderer, View
 from surgical_marl.view.shading import CLOTH, Material, named
-from surgical_marl.view.skin import skins
 from surgical_marl.view.stage import paint, stage
 from surgical_marl.view.tracer import PLANE
+from surgical_marl.vision.skin import skins
 
 Picture = Any
 

@@ -23,10 +23,10 @@ from surgical_marl.scenes.scene import Scene
 from surgical_marl.view.camera import best_view
 from surgical_marl.view.record import HEIGHT, WIDTH
 from surgical_marl.view.render import Renderer
-from surgical_marl.view.skin import skins
 from surgical_marl.view.stage import paint, stage
 from surgical_marl.vision.endoscope import SIZE, Endoscope
 from surgical_marl.vision.raycaster import GROUPS
+from surgical_marl.vision.skin import skins
 
 NUM_ENVS = {"cpu": 64, "cuda": 8192}
 """Default number of environments on each device."""

@@ -94,10 +94,11 @@ class PictureTerms:
         }
 
     def _draw(self, place: str) -> Seen:
-        objects = None
+        objects = nodes = None
         if self._free_objects.drawn:
             objects = self._free_objects.read_drawn(self._engine, self._num_envs, self._library, place)
-        return self._pictures.draw(self._read(f"{place}.physics.arms.qpos"), self._rows(place), objects)
+            nodes = self._free_objects.read_nodes(self._engine, self._library, place)
+        return self._pictures.draw(self._read(f"{place}.physics.arms.qpos"), self._rows(place), objects, nodes)
 
     def _rows(self, place: str) -> Any:
         if not self._matched:

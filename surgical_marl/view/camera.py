@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from surgical_marl.robots.spec import VISUAL_GROUP
 from surgical_marl.scenes.scene import Scene
 from surgical_marl.view.render import View
-from surgical_marl.view.skin import skins
+from surgical_marl.vision.skin import skins
 
 if TYPE_CHECKING:
     from surgical_marl.tasks.base.task import Task

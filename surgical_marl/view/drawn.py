@@ -12,11 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from surgical_marl.view.lighting import GLOW, GRAIN
-from surgical_marl.view.shading import GAMMA, PLASTIC, Material, materials, visual_rgba
-from surgical_marl.view.skin import Skin
+from surgical_marl.view.shading import GAMMA, PLASTIC, Material, flesh, materials, visual_rgba
 from surgical_marl.view.tracer import PLANE, Shape, World, wp
 from surgical_marl.vision.raycaster import GROUPS, KINDS, corner_normals, warp_mesh
 from surgical_marl.vision.rays import CAPSULE, CYLINDER, ELLIPSOID, FAR, MESH
+from surgical_marl.vision.skin import Skin
 
 Array = NDArray[np.float64]
 
@@ -89,7 +89,7 @@ class Drawn:
         looks = [
             *(made[geom] for geom in geoms),
             *(extra.material for extra in stage),
-            *(skin.material for skin in skins),
+            *(flesh(skin) for skin in skins),
         ]
         for row, of in zip(shapes, looks, strict=True):
             row["colour"], row["gloss"], row["pattern"] = of

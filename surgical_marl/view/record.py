@@ -21,9 +21,9 @@ from surgical_marl.view.camera import Focus, best_view, task_places
 from surgical_marl.view.drawn import Sphere
 from surgical_marl.view.render import Renderer, View
 from surgical_marl.view.shading import GOAL_RADIUS, goal_colour
-from surgical_marl.view.skin import skins
 from surgical_marl.view.stage import paint, stage
 from surgical_marl.view.video import write_video
+from surgical_marl.vision.skin import skins
 
 if TYPE_CHECKING:
     from surgical_marl.envs.batch import BatchedEnv

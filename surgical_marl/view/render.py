@@ -24,7 +24,7 @@ from surgical_marl.content import unknown
 from surgical_marl.view import painter, tracer
 from surgical_marl.view.drawn import Drawn, Extra, Sphere
 from surgical_marl.view.shading import Material
-from surgical_marl.view.skin import Skin
+from surgical_marl.vision.skin import Skin
 
 Array = NDArray[np.float64]
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from surgical_marl.scenes.objects import Placement
 from surgical_marl.view.lighting import PLAIN, TISSUE
+from surgical_marl.vision.skin import Skin
 
 Colour = tuple[float, float, float]
 """Red, green and blue as files give them, from 0 to 1."""
@@ -95,6 +96,11 @@ def material(rgb: Array, fleshy: bool = False, broad: bool = False) -> Material:
     if light > 0.87 or (light > 0.55 and broad):
         return Material(colour, CLOTH if fleshy else PLASTIC, int(PLAIN))
     return Material(colour, STEEL if light > 0.55 else PAINT if light > 0.3 else RUBBER, int(PLAIN))
+
+
+def flesh(skin: Skin) -> Material:
+    """Return the material of tissue."""
+    return material(skin.colour, fleshy=True)
 
 
 def materials(

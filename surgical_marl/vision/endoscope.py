@@ -1,11 +1,11 @@
 """Pictures from a scene's endoscope for many environments at once: colour, depth and the geom of each pixel.
 
     endoscope = Endoscope(load_scene("trimanual_psm_ecm"), num_envs=1024)
-    view = endoscope.render(env.qpos, env.drawn_poses)
+    view = endoscope.render(env.qpos, env.drawn_poses, env.drawn_nodes)
     view.rgb                                    # [N, eyes, 64, 64, 3] uint8
 
-Pictures depend on joint positions [N, nq] and on the poses of free objects alone, in numpy or torch. Any engine has
-them, so no second physics is needed. `vision/kinematics.py` computes the poses of all that is seen, and
+Pictures depend on joint positions [N, nq], the poses of free objects and the nodes of tissue alone, in numpy or torch.
+Any engine has them, so no second physics is needed. `vision/kinematics.py` computes the poses of all that is seen, and
 `vision/raycaster.py` draws it, on a GPU or a CPU with the same code; docs/rendering.md compares the pictures with
 C MuJoCo's ray caster.
 """
@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import numbers
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -95,11 +95,13 @@ class SceneCameras:
         self._warp = prepare_warp()
         from surgical_marl.vision.kinematics import Kinematics
         from surgical_marl.vision.raycaster import RayCaster
+        from surgical_marl.vision.skin import skins
 
         ids = [scene.model.camera(camera).id for camera in cameras]
         with self._warp.ScopedDevice(device):
             self._kinematics = Kinematics(scene.model, num_envs)
-            self._caster = RayCaster(scene.model, ids, num_envs, width, height, BACKGROUND)
+            own_skins = skins(scene.systems, scene.model)
+            self._caster = RayCaster(scene.model, ids, num_envs, width, height, BACKGROUND, own_skins)
         own, count = self._kinematics, scene.model.nmocap
         self._shapes = {
             "qpos": (num_envs, scene.model.nq),
@@ -110,13 +112,19 @@ class SceneCameras:
         same = (lambda values: values.numpy()) if device == "cpu" else self._warp.to_torch
         self._given = {name: same(values) for name, values in given.items()}
         """Arrays of numpy or torch in the memory of Warp's, to be filled."""
+        surfaces = self._caster.surfaces
+        self._nodes = {name: same(surfaces.nodes)[:, rows] for name, rows in surfaces.slices.items()}
+        self._rest, self._at_rest = surfaces.rest, True
         self._warp.synchronize_device(device)  # the arrays were made on Warp's own stream
 
-    def render(self, qpos: Any, objects: Poses | None = None) -> View:
+    def render(self, qpos: Any, objects: Poses | None = None, nodes: Mapping[str, Any] | None = None) -> View:
         """Draw the pictures of the cameras at joint positions [N, nq] of the whole scene.
 
         Free objects are where `objects` says, as `BatchedEnv.drawn_poses` does, in arrays of the same library as
         `qpos`; without it they are where the scene places them.
+
+        Tissue is a smooth surface through its `nodes` [N, n, 3] by name, m, as `BatchedEnv.drawn_nodes` has them; it is
+        at rest without them. Those of other systems are passed by.
 
         The pictures are numpy arrays for a numpy array, and torch tensors for a torch tensor.
 
@@ -133,6 +141,8 @@ class SceneCameras:
         for name, own in self._given.items():
             if name in given:
                 self._fill(own, given[name])
+        if self._nodes:
+            self._bend(nodes)
         drawn = {name: self._empty(name) for name in CHANNELS}
         with self._stream():
             self._kinematics.update(moved=objects is not None and "origin" in self._given)
@@ -143,6 +153,18 @@ class SceneCameras:
         elif not tensor and self.device == "cuda":
             found = {name: picture.cpu().numpy() for name, picture in found.items()}
         return View(**found)
+
+    def _bend(self, nodes: Mapping[str, Any] | None) -> None:
+        """Put the nodes of tissue where they are; at rest if there is None."""
+        if nodes is None and self._at_rest:
+            return
+        for name, own in self._nodes.items():
+            given = np.broadcast_to(self._rest[name], tuple(own.shape)) if nodes is None else nodes.get(name)
+            if given is None or tuple(given.shape) != tuple(own.shape):
+                found = "there are none" if given is None else f"not {tuple(given.shape)}"
+                raise ValueError(f"nodes[{name!r}] must be {tuple(own.shape)}, {found}")
+            self._fill(own, given)
+        self._at_rest = nodes is None
 
     def _fill(self, own: Any, values: Any) -> None:
         """Copy values of numpy or torch into an array of the device."""

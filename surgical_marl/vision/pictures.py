@@ -57,15 +57,18 @@ class Pictures:
             for picture in dict.fromkeys(picture for picture in every if picture.table is not None)
         }
 
-    def draw(self, qpos: Any, rows: Any, objects: Poses | None = None) -> dict[str, dict[str, Any]]:
+    def draw(
+        self, qpos: Any, rows: Any, objects: Poses | None = None, nodes: Mapping[str, Any] | None = None
+    ) -> dict[str, dict[str, Any]]:
         """Return agent -> term -> picture [N, H, W, C]. On a GPU nothing waits for the host.
 
         Args:
             qpos: joint positions [N, nq] of the whole scene.
             rows: of the tables, [N] int64; None without pictures to be matched.
             objects: where free objects are; None for where the scene places them, as in all pictures to be matched.
+            nodes: where those of tissue are, by name, [N, n, 3]; None for where they rest, likewise.
         """
-        views = {camera: endoscope.render(qpos, objects) for camera, endoscope in self._endoscopes.items()}
+        views = {camera: endoscope.render(qpos, objects, nodes) for camera, endoscope in self._endoscopes.items()}
         return {
             agent: {
                 name: self.wanted(agent, name, rows) if self.is_matched(agent, name) else _cut(views[term.camera], term)

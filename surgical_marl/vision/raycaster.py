@@ -9,7 +9,9 @@ import mujoco
 import numpy as np
 
 from surgical_marl.runtime import prepare_warp
-from surgical_marl.vision.rays import BOX, CAPSULE, CYLINDER, ELLIPSOID, MESH, TILE, Light, cull, make_draw, place
+from surgical_marl.vision.rays import BOX, CAPSULE, CYLINDER, ELLIPSOID, MESH, SKIN, TILE, Light, cull, make_draw, place
+from surgical_marl.vision.skin import SMOOTH, Skin
+from surgical_marl.vision.surfaces import Surfaces
 
 wp = prepare_warp()
 
@@ -17,8 +19,6 @@ GROUPS = 3
 """Geoms of the groups below this one are drawn."""
 BLOCK = 128
 """Threads in a CUDA block."""
-SMOOTH = 0.8
-"""A mesh looks smooth where its faces' directions differ by less than this cosine, as in MuJoCo."""
 KINDS = {
     mujoco.mjtGeom.mjGEOM_SPHERE: ELLIPSOID,
     mujoco.mjtGeom.mjGEOM_ELLIPSOID: ELLIPSOID,
@@ -38,6 +38,10 @@ class RayCaster:
         num_envs: N.
         width, height: of a picture, pixels.
         background: colour of what no geom covers, from 0 to 1.
+        skins: drawn in place of their geoms.
+
+    Attributes:
+        surfaces: the skins in all copies.
     """
 
     def __init__(
@@ -48,9 +52,15 @@ class RayCaster:
         width: int,
         height: int,
         background: Sequence[float],
+        skins: Sequence[Skin] = (),
     ) -> None:
-        geoms = np.flatnonzero((model.geom_group < GROUPS) & (model.geom_rgba[:, 3] > 0))
+        shown = (model.geom_group < GROUPS) & (model.geom_rgba[:, 3] > 0)
+        for skin in skins:
+            shown[skin.geoms] = np.isin(np.arange(len(skin.geoms)), skin.owners)
+        geoms = np.flatnonzero(shown)
         kinds = np.array([KINDS[mujoco.mjtGeom(kind)] for kind in model.geom_type[geoms]], np.int32)
+        for skin in skins:
+            kinds[np.isin(geoms, skin.geoms)] = SKIN
         meshes = np.where(kinds == MESH, model.geom_dataid[geoms], -1)
         pictures, tiles = num_envs * len(cameras), -(-width // TILE) * -(-height // TILE)
         pixel = float(2 * np.tan(np.radians(model.cam_fovy[cameras[0]]) / 2) / height)
@@ -67,7 +77,8 @@ class RayCaster:
         self._counts = wp.empty((pictures, tiles), dtype=int)
         self._screen = pixel, width, height
         self._light, self._background = _light(model), wp.vec3(*background)
-        self._draw = make_draw(bool(self._meshes))
+        self.surfaces = Surfaces(skins, geoms, num_envs)
+        self._draw = make_draw(bool(self._meshes), bool(skins))
 
     def draw(self, data: Any, rgb: Any, depth: Any, segmentation: Any) -> None:
         """Write pictures into arrays [N * C, height, width], or [N * C, height, width, 3] for colour.
@@ -83,11 +94,14 @@ class RayCaster:
         """
         cameras, placed = [data.cam_xpos, data.cam_xmat, self._cameras], [self._turns, self._eyes]
         listed = [self._listed, self._counts]
-        inputs = [data.geom_xpos, data.geom_xmat, self._geoms, *cameras, *placed]
+        own = self.surfaces
+        own.update()
+        inputs = [data.geom_xpos, data.geom_xmat, self._geoms, self._kinds, *cameras, own.balls, *placed]
         wp.launch(place, self._turns.shape, inputs, block_dim=BLOCK)
-        inputs = [self._kinds, self._sizes, *placed, *self._screen, *listed]
+        inputs = [self._kinds, self._sizes, *placed, own.balls, len(self._cameras), *self._screen, *listed]
         wp.launch(cull, self._counts.shape, inputs, block_dim=BLOCK)
         inputs = [self._kinds, self._sizes, self._colours, self._geoms, self._handles, self._first_faces, self._normals]
+        inputs += [own.nodes, own.faces, own.firsts, own.counts, own.normals]
         inputs += [*placed, *listed, *cameras, *self._screen, self._light, self._background]
         inputs += [_warp(rgb, wp.vec3ub), _warp(depth, wp.float32), _warp(segmentation, wp.int32)]
         wp.launch(self._draw, (*self._counts.shape, TILE**2), inputs, block_dim=BLOCK)

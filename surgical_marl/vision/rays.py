@@ -1,8 +1,8 @@
 """Casts a ray through every pixel of many cameras' pictures, in three kernels.
 
-Every shape except a mesh is convex, so a ray is inside it between two depths. `place` puts the shapes
-into the cameras' frames, `cull` lists for every tile of a picture the shapes that some of its rays may meet, and `draw`
-tests only those. Threads of a warp share a tile, so they test the same shapes at the same time.
+Every shape except a mesh and a part of a skin is convex, so a ray is inside it between two depths. `place` puts the
+shapes into the cameras' frames, `cull` lists for every tile of a picture the shapes that some of its rays may meet, and
+`draw` tests only those. Threads of a warp share a tile, so they test the same shapes at the same time.
 """
 
 # Kernels are Warp's language, which only looks like Python. Annotations are read as they are, without a
@@ -20,7 +20,7 @@ wp.set_module_options({"enable_backward": False, "default_grid_stride": False, "
 TILE = wp.constant(8)
 """Pixels along each side of a tile."""
 TINY, FAR = wp.constant(1e-9), wp.constant(1e6)
-ELLIPSOID, CAPSULE, CYLINDER, BOX, MESH = map(wp.constant, range(5))
+ELLIPSOID, CAPSULE, CYLINDER, BOX, MESH, SKIN = map(wp.constant, range(6))
 
 
 @wp.struct
@@ -112,11 +112,34 @@ def reach(kind: int, size: wp.vec3, n: wp.vec3):
     """Return the greatest value of n . x over all points x of a shape."""
     if kind == BOX or kind == MESH:  # a mesh is in its box
         return wp.dot(size, wp.abs(n))
-    if kind == ELLIPSOID:
+    if kind == ELLIPSOID or kind == SKIN:  # a part of a skin is in its ball
         return wp.length(wp.cw_mul(size, n))
     if kind == CYLINDER:
         return size[0] * wp.sqrt(n[0] * n[0] + n[1] * n[1]) + size[1] * wp.abs(n[2])
     return size[0] * wp.length(n) + size[1] * wp.abs(n[2])
+
+
+@wp.func
+def size_of(kind: int, shape: int, env: int, sizes: wp.array[wp.vec3], balls: wp.array2d[wp.vec4]):
+    if kind == SKIN:
+        return wp.vec3(balls[env, shape][3])
+    return sizes[shape]
+
+
+@wp.func
+def meets(p: wp.vec3, v: wp.vec3, a: wp.vec3, b: wp.vec3, c: wp.vec3):
+    """Return the depth t at which p + t v is in a triangle, and its shares of b and c; t is -1 if it never is.
+
+    Möller and Trumbore, Journal of Graphics Tools 2(1), 1997. Neighbours overlap by a millionth, so that no ray passes.
+    """
+    one, other, away = b - a, c - a, p - a
+    across = wp.cross(v, other)
+    volume = wp.dot(one, across)
+    scale = 1.0 / wp.where(wp.abs(volume) > 1e-18, volume, 1e-18)
+    around = wp.cross(away, one)
+    u, w, t = scale * wp.dot(away, across), scale * wp.dot(v, around), scale * wp.dot(other, around)
+    inside = u >= -1e-6 and w >= -1e-6 and u + w <= 1.000001
+    return wp.vec3(wp.where(inside, t, -1.0), u, w)
 
 
 @wp.func
@@ -134,15 +157,25 @@ def place(
     geom_xpos: wp.array2d[wp.vec3],
     geom_xmat: wp.array2d[wp.mat33],
     geoms: wp.array[int],
+    kinds: wp.array[int],
     cam_xpos: wp.array2d[wp.vec3],
     cam_xmat: wp.array2d[wp.mat33],
     cameras: wp.array[int],
+    balls: wp.array2d[wp.vec4],
     turns: wp.array2d[wp.mat33],
     eyes: wp.array2d[wp.vec3],
 ):
-    """Rotations from a camera's frame to a shape's, and places of the eye there; both [pictures, shapes]."""
+    """Rotations from a camera's frame to a shape's, and places of the eye there; both [pictures, shapes].
+
+    The frame of a part of a skin is the world's, about the middle of its ball.
+    """
     picture, shape = wp.tid()
     env, camera, geom = picture // cameras.shape[0], cameras[picture % cameras.shape[0]], geoms[shape]
+    if kinds[shape] == SKIN:
+        turns[picture, shape] = cam_xmat[env, camera]
+        ball_of = balls[env, shape]
+        eyes[picture, shape] = cam_xpos[env, camera] - wp.vec3(ball_of[0], ball_of[1], ball_of[2])
+        return
     back = wp.transpose(geom_xmat[env, geom])
     turns[picture, shape] = back @ cam_xmat[env, camera]
     eyes[picture, shape] = back @ (cam_xpos[env, camera] - geom_xpos[env, geom])
@@ -154,6 +187,8 @@ def cull(
     sizes: wp.array[wp.vec3],
     turns: wp.array2d[wp.mat33],
     eyes: wp.array2d[wp.vec3],
+    balls: wp.array2d[wp.vec4],
+    cameras: int,
     pixel: float,
     width: int,
     height: int,
@@ -172,7 +207,8 @@ def cull(
     right, bottom = left + float(TILE) * pixel, top - float(TILE) * pixel
     count = int(0)
     for shape in range(kinds.shape[0]):
-        kind, size, turn, eye = kinds[shape], sizes[shape], turns[picture, shape], eyes[picture, shape]
+        kind, turn, eye = kinds[shape], turns[picture, shape], eyes[picture, shape]
+        size = size_of(kind, shape, picture // cameras, sizes, balls)
         n = turn @ wp.vec3(0.0, 0.0, -1.0)
         seen = reach(kind, size, n) >= wp.dot(n, eye)
         if seen:
@@ -194,8 +230,8 @@ def cull(
 
 
 @cache
-def make_draw(meshes: bool) -> Any:
-    """Return the last kernel, `draw`; without meshes it needs fewer registers."""
+def make_draw(meshes: bool, skins: bool) -> Any:
+    """Return the last kernel, `draw`; without meshes or skins it needs fewer registers."""
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options={"fast_math": True})
     def draw(
@@ -206,6 +242,11 @@ def make_draw(meshes: bool) -> Any:
         mesh_ids: wp.array[wp.uint64],
         first_faces: wp.array[int],
         face_normals: wp.array2d[wp.vec3],
+        nodes: wp.array2d[wp.vec3],
+        faces: wp.array2d[int],
+        firsts: wp.array[int],
+        face_counts: wp.array[int],
+        corner_normals: wp.array2d[wp.vec3],
         turns: wp.array2d[wp.mat33],
         eyes: wp.array2d[wp.vec3],
         listed: wp.array3d[wp.uint16],
@@ -244,7 +285,18 @@ def make_draw(meshes: bool) -> Any:
                     query = wp.mesh_query_ray(mesh_ids[shape], p, v, best)
                     if query.result:
                         t, u, w, face = float(query.t), float(query.u), float(query.v), int(query.face)
-            if kind != MESH:
+            if wp.static(skins):
+                if kind == SKIN:
+                    own, nearest = picture // cameras.shape[0], float(best)
+                    eye = cam_xpos[own, cameras[picture % cameras.shape[0]]]
+                    for k in range(2 * firsts[shape], 2 * (firsts[shape] + face_counts[shape])):
+                        quad, half = k // 2, k % 2
+                        a, b = nodes[own, faces[quad, 0]], nodes[own, faces[quad, 1 + half]]
+                        found = meets(eye, v, a, b, nodes[own, faces[quad, 2 + half]])
+                        if found[0] >= 0.0 and found[0] < nearest:
+                            t, u, w, face = float(found[0]), float(found[1]), float(found[2]), int(k)
+                            nearest = float(found[0])
+            if kind < MESH:
                 depths = span(kind, sizes[shape], p, v)
                 if depths[0] <= depths[1]:
                     t = wp.where(depths[0] >= 0.0, depths[0], depths[1])  # from inside, its far side
@@ -264,6 +316,11 @@ def make_draw(meshes: bool) -> Any:
                 if kinds[hit] == MESH:
                     f = first_faces[hit] + face
                     normal = u * face_normals[f, 0] + w * face_normals[f, 1] + (1.0 - u - w) * face_normals[f, 2]
+            if wp.static(skins):
+                if kinds[hit] == SKIN:
+                    own, corner, half = picture // cameras.shape[0], 4 * (face // 2), face % 2
+                    normal = (1.0 - u - w) * corner_normals[own, corner]
+                    normal += u * corner_normals[own, corner + 1 + half] + w * corner_normals[own, corner + 2 + half]
             normal = wp.normalize(wp.transpose(turn) @ normal)
             view = -wp.normalize(ray)
             if wp.dot(normal, view) < 0.0:  # seen from inside

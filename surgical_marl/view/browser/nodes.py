@@ -16,9 +16,9 @@ from surgical_marl.tasks.base.task import APPROACH
 from surgical_marl.view.browser.shapes import body_glb, stage_glb
 from surgical_marl.view.moment import Moment, Push
 from surgical_marl.view.session import Session
-from surgical_marl.view.shading import AGENTS, GAMMA, GOAL_RADIUS, materials
-from surgical_marl.view.skin import Skin, skins
+from surgical_marl.view.shading import AGENTS, GAMMA, GOAL_RADIUS, flesh, materials
 from surgical_marl.view.stage import paint, stage
+from surgical_marl.vision.skin import Skin, skins
 
 if TYPE_CHECKING:
     from viser import ViserServer
@@ -159,7 +159,7 @@ class Nodes:
 
     def _make_skin(self, skin: Skin, nodes: np.ndarray) -> list[Any]:
         """Return a mesh for each environment, of nodes [N, n, 3]."""
-        rgb = (255 * skin.material.colour ** (1 / GAMMA)).astype(np.uint8)
+        rgb = (255 * flesh(skin).colour ** (1 / GAMMA)).astype(np.uint8)
         return [
             self._scene.add_mesh_simple(
                 f"/skins/{skin.name}/{env}", own.astype(np.float32), skin.triangles, color=rgb, position=offset

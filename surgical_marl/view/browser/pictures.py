@@ -42,8 +42,9 @@ class Pictures:
         """Show the current pictures."""
         shown = {}
         if self._endoscope is not None:
-            qpos, poses = self._session.env.qpos, self._session.env.drawn_poses
-            view = self._endoscope.render(qpos[:1], Poses(poses.origin[:1], poses.quaternion[:1]))
+            env = self._session.env
+            poses, nodes = env.drawn_poses, {name: every[:1] for name, every in env.drawn_nodes.items()}
+            view = self._endoscope.render(env.qpos[:1], Poses(poses.origin[:1], poses.quaternion[:1]), nodes)
             shown[f"endoscope of {self._endoscope.agent}"] = view.rgb[0, 0]
         shown |= observed(self._session.observations)
         for name, picture in shown.items():

@@ -2,6 +2,8 @@
 
 own = skins(scene.systems, scene.model)
 Renderer(scene.model, skins=own).render(data, nodes=[skin.rest for skin in own])
+
+`surgical_marl/vision/surfaces.py` draws them for many environments.
 """
 
 from __future__ import annotations
@@ -14,10 +16,10 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from surgical_marl.view.shading import Material, material
-from surgical_marl.vision.raycaster import SMOOTH
-
 Array = NDArray[np.float64]
+
+SMOOTH = 0.8
+"""A surface looks smooth where its faces' directions differ by less than this cosine, as in MuJoCo."""
 
 _HALVES = [[0, 1, 2], [0, 2, 3]]
 """Corners of the two triangles of a face."""
@@ -32,7 +34,10 @@ class _Surface(NamedTuple):
     """Nodes around each face, counterclockwise as seen from outside, [f, 4]."""
     geoms: NDArray[np.int64]
     """Geoms of the model that it is drawn in place of: the bars of the system."""
-    material: Material
+    middles: Array
+    """Where these are at rest, m, [geoms, 3]."""
+    colour: Array
+    """From 0 to 1, [3]."""
 
 
 class Skin(_Surface):
@@ -48,14 +53,20 @@ class Skin(_Surface):
 
         At a corner, the normals of the faces are averaged between which the surface is smooth at rest.
         """
-        corners, faces = self._smooth
+        corners, faces = self.joined
         found = np.zeros((self.faces.size, 3))
         np.add.at(found, corners, _crossed(nodes[self.faces])[faces])
         found /= np.maximum(np.linalg.norm(found, axis=1, keepdims=True), 1e-30)
         return found.reshape(-1, 4, 3)[:, _HALVES].reshape(-1, 3, 3)
 
     @cached_property
-    def _smooth(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    def owners(self) -> NDArray[np.intp]:
+        """Return which of `geoms` each face is drawn in place of, [f]: that which is nearest at rest."""
+        away = self.rest[self.faces].mean(1)[:, None] - self.middles
+        return np.square(away).sum(-1).argmin(1)
+
+    @cached_property
+    def joined(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
         """Pairs of a corner and of a face that is smoothly joined there."""
         flat = _crossed(self.rest[self.faces])
         flat /= np.linalg.norm(flat, axis=1, keepdims=True)
@@ -71,8 +82,8 @@ def skins(systems: Mapping[str, Any], model: mujoco.MjModel) -> list[Skin]:
     found = []
     for name, system in systems.items():
         if (bars := system.bars) is not None and _has_skin(system):
-            look = material(np.array(bars.colour), fleshy=True)
-            found.append(Skin(name, bars.start, system.faces, np.flatnonzero(owners == name), look))
+            geoms, middles = np.flatnonzero(owners == name), bars.start[bars.ends].mean((1, 2))
+            found.append(Skin(name, bars.start, system.faces, geoms, middles, np.array(bars.colour)))
     return found
 
 

@@ -1,4 +1,4 @@
-"""Tissue in pictures for people and in the viewer: a smooth surface that follows its nodes."""
+"""Tissue in pictures for agents and people and in the viewer: a smooth surface that follows its nodes."""
 
 from __future__ import annotations
 
@@ -13,8 +13,10 @@ import surgical_marl as sm
 from surgical_marl.scenes.scene import Scene
 from surgical_marl.view.moment import Moment
 from surgical_marl.view.render import Renderer, View
-from surgical_marl.view.skin import Skin, skins
 from surgical_marl.view.stage import paint, stage
+from surgical_marl.vision.endoscope import CHANNELS, Endoscope
+from surgical_marl.vision.skin import Skin, skins
+from tests.helpers.devices import DEVICES, skip_where_warp_lacks
 
 SIZE = 64
 UP, ALONG = np.array([0.0, 0.0, 1.0]), np.array([1.0, 0.0, 0.0])
@@ -116,3 +118,61 @@ def still(scene: Scene, nodes: dict[str, np.ndarray]) -> Any:
     task = SimpleNamespace(has_targets=False)
     env = SimpleNamespace(scene=scene, num_envs=2, agents=scene.agents, task=task, max_steps=1, control_dt=0.02)
     return SimpleNamespace(env=env, moment=lambda: moment, steps=0)
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_an_endoscope_shows_the_surface(device: str) -> None:
+    """Bent in the second environment: where plain rays meet its triangles, nearest, and as smooth as they are."""
+    skip_where_warp_lacks(device)
+    scene = sm.load_scene("trimanual_psm_ecm_suture")
+    (skin,) = skins(scene.systems, scene.model)
+    bent = skin.rest + np.outer(8.0 * (skin.rest[:, 0] - skin.rest[:, 0].mean()) ** 2, UP)
+    places = np.stack([skin.rest, bent]).astype(np.float32)
+    endoscope = Endoscope(scene, 2, device, width=SIZE, height=SIZE, channels=CHANNELS)
+    qpos = np.repeat(scene.home[None], 2, 0)
+    view = endoscope.render(qpos, nodes={skin.name: places, "thread": np.zeros((2, 40, 3))})
+    shown = view.segmentation[:, 0]
+    for nodes, geoms, depth in zip(places, shown, view.depth[:, 0], strict=True):
+        found = rays_depth(scene, nodes[skin.triangles].astype(float))
+        covered = np.isin(geoms, skin.geoms)
+        assert covered.mean() > 0.03
+        np.testing.assert_allclose(depth[covered], found[covered], atol=1e-5)
+        assert (found[~covered] > depth[~covered] - 1e-5).mean() > 0.999
+    surfaces = endoscope._caster.surfaces
+    normals = np.asarray(surfaces.normals.numpy()).reshape(2, -1, 4, 3)
+    for nodes, own in zip(places, normals, strict=True):
+        one, other = np.moveaxis(skin.normals(nodes.astype(float)).reshape(-1, 2, 3, 3), 1, 0)
+        expected = np.concatenate([one, other[:, -1:]], 1)[np.argsort(skin.owners, kind="stable")]
+        np.testing.assert_allclose(own, expected, atol=1e-4)
+    still = endoscope.render(qpos)
+    np.testing.assert_array_equal(still.rgb[:, 0], np.repeat(view.rgb[:1, 0], 2, 0))
+
+
+def rays_depth(scene: Scene, triangles: np.ndarray) -> np.ndarray:
+    """Return the depth at which the ray of each pixel of the left eye first meets triangles [t, 3, 3]; else inf."""
+    data = mujoco.MjData(scene.model)
+    data.qpos[:] = scene.home
+    mujoco.mj_kinematics(scene.model, data)
+    mujoco.mj_camlight(scene.model, data)
+    camera = data.cam("ecm_0/left")
+    scale = 2 * np.tan(np.radians(scene.model.camera("ecm_0/left").fovy[0]) / 2) / SIZE
+    rows, columns = np.mgrid[:SIZE, :SIZE].reshape(2, -1) + 0.5
+    rays = np.stack([(columns - SIZE / 2) * scale, (SIZE / 2 - rows) * scale, -np.ones(SIZE**2)], 1)
+    corners = (triangles - camera.xpos) @ camera.xmat.reshape(3, 3)  # in the camera's frame
+    found = np.full(SIZE**2, np.inf)
+    for corner in corners:  # x a + y b + z c = t ray, with x, y, z >= 0
+        if abs(np.linalg.det(corner)) > 1e-15:
+            shares = rays @ np.linalg.inv(corner)
+            depth = 1 / np.where(shares.sum(1) == 0, np.inf, shares.sum(1))
+            found = np.where((shares >= -1e-9).all(1) & (depth > 0) & (depth < found), depth, found)
+    return found.reshape(SIZE, SIZE)
+
+
+@pytest.mark.parametrize(
+    ("nodes", "words"),
+    [({}, r"nodes\['wound'\] must be .*there are none"), ({"wound": np.zeros((1, 3, 3))}, r"not \(1, 3, 3\)")],
+)
+def test_nodes_that_do_not_fit_are_one_sentence(nodes: dict[str, Any], words: str) -> None:
+    scene = sm.load_scene("trimanual_psm_ecm_suture")
+    with pytest.raises(ValueError, match=words):
+        Endoscope(scene, width=8, height=8).render(scene.home[None], nodes=nodes)
