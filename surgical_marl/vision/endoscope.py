@@ -124,7 +124,7 @@ class SceneCameras:
         `qpos`; without it they are where the scene places them.
 
         Tissue is a smooth surface through its `nodes` [N, n, 3] by name, m, as `BatchedEnv.drawn_nodes` has them; it is
-        at rest without them. Those of other systems are passed by.
+        at rest without both. Those of other systems are passed by.
 
         The pictures are numpy arrays for a numpy array, and torch tensors for a torch tensor.
 
@@ -142,6 +142,8 @@ class SceneCameras:
             if name in given:
                 self._fill(own, given[name])
         if self._nodes:
+            if nodes is None and objects is not None:
+                raise ValueError(f"poses come without the nodes of {', '.join(self._nodes)}: pass env.drawn_nodes too")
             self._bend(nodes)
         drawn = {name: self._empty(name) for name in CHANNELS}
         with self._stream():

@@ -231,8 +231,9 @@ def test_the_endoscope_sees_thread_and_tissue_where_their_nodes_are(library: str
             return torch.from_numpy(values) if library == "torch" else values
 
     engine: Any = Engine()
-    poses, qpos = FreeObjects(scene).read_drawn(engine, 2, library), np.repeat(scene.home[None], 2, 0)
-    seen = endoscope.render(torch.from_numpy(qpos) if library == "torch" else qpos, poses)
+    own, qpos = FreeObjects(scene), np.repeat(scene.home[None], 2, 0)
+    poses, nodes = own.read_drawn(engine, 2, library), own.read_nodes(engine, library)
+    seen = endoscope.render(torch.from_numpy(qpos) if library == "torch" else qpos, poses, nodes)
     labels = endoscope.labels[np.asarray(seen.segmentation)]
     for name, pixels in (("wound", 100), ("thread", 4), ("pad", 100)):  # a thread is thin
         assert (labels == endoscope.label_names.index(name)).sum() >= pixels, name

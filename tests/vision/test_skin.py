@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import surgical_marl as sm
+from surgical_marl.scenes.poses import Poses
 from surgical_marl.scenes.scene import Scene
 from surgical_marl.view.moment import Moment
 from surgical_marl.view.render import Renderer, View
@@ -170,9 +171,15 @@ def rays_depth(scene: Scene, triangles: np.ndarray) -> np.ndarray:
 
 @pytest.mark.parametrize(
     ("nodes", "words"),
-    [({}, r"nodes\['wound'\] must be .*there are none"), ({"wound": np.zeros((1, 3, 3))}, r"not \(1, 3, 3\)")],
+    [
+        (None, "come without the nodes of wound: pass env.drawn_nodes"),
+        ({}, r"nodes\['wound'\] must be .*there are none"),
+        ({"wound": np.zeros((1, 3, 3))}, r"not \(1, 3, 3\)"),
+    ],
 )
-def test_nodes_that_do_not_fit_are_one_sentence(nodes: dict[str, Any], words: str) -> None:
+def test_nodes_that_do_not_fit_are_one_sentence(nodes: dict[str, Any] | None, words: str) -> None:
     scene = sm.load_scene("trimanual_psm_ecm_suture")
+    count = scene.model.nmocap
+    poses = Poses(np.zeros((1, count, 3)), np.tile([1.0, 0.0, 0.0, 0.0], (1, count, 1)))
     with pytest.raises(ValueError, match=words):
-        Endoscope(scene, width=8, height=8).render(scene.home[None], nodes=nodes)
+        Endoscope(scene, width=8, height=8).render(scene.home[None], poses, nodes)
