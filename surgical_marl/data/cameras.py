@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from surgical_marl.content import unknown
-from surgical_marl.data.recording import Recording
+from surgical_marl.data.recording import NODES, Recording
 from surgical_marl.data.request import CHANNELS, PICTURES, VIEWS
 from surgical_marl.runtime import has_cuda
 from surgical_marl.scenes.poses import Poses
@@ -88,11 +88,13 @@ class Cameras:
     def draw(self, recording: Recording) -> Iterator[dict[str, np.ndarray]]:
         """Yield the pictures of some rows at a time, name -> [n, H, W, C], up to the last of the T + 1 rows."""
         parts = [recording.seen[name] for name in ("qpos", "origin", "quaternion")]
+        soft = {name: part for name, part in recording.seen.items() if name.startswith(NODES)}
         rows = len(parts[0])
         for first in range(0, rows, self._at_once):
             chosen = np.minimum(np.arange(first, first + self._at_once), rows - 1)
             qpos, origin, quaternion = (part[chosen] for part in parts)
-            views = {key: own.render(qpos, Poses(origin, quaternion)) for key, own in self._cameras.items()}
+            nodes = {name.removeprefix(NODES): part[chosen] for name, part in soft.items()}
+            views = {key: own.render(qpos, Poses(origin, quaternion), nodes) for key, own in self._cameras.items()}
             count = min(self._at_once, rows - first)
             found = {}
             for picture in self._pictures:

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from surgical_marl.data.cameras import Cameras, Picture
-from surgical_marl.data.recording import Recording
+from surgical_marl.data.recording import NODES, Recording
 from surgical_marl.files import remove_temporaries, write_atomic, write_npz, write_text
 from surgical_marl.untrusted.arrays import read_npz
 from surgical_marl.untrusted.files import MAX_JSON, is_file, read_json
@@ -33,7 +33,7 @@ ABOUT = "about.json"
 ENCODING = "-preset fast -crf 18 -g 2 -bf 0"
 """Of films: a picture is decoded from at most two, because learners read them in any order."""
 LEVELS = 256
-_POSES = ("origin", "quaternion")
+_POSES = ("origin", "quaternion", NODES)
 
 
 class Episode(NamedTuple):
@@ -135,7 +135,8 @@ def add_episode(
     arrays = {"place": np.array(recording.place)}
     for kind, values in (("pictures", pictures), ("levels", levels), ("done", recording.done)):
         arrays |= {f"{kind}/{name}": value for name, value in values.items()}
-    arrays |= {f"seen/{name}": value for name, value in recording.seen.items() if name not in _POSES}
+    kept = {name: value for name, value in recording.seen.items() if not name.startswith(_POSES)}
+    arrays |= {f"seen/{name}": value for name, value in kept.items()}
     write_npz(folder / f"episode-{number:06d}.npz", arrays)
 
 

@@ -26,13 +26,17 @@ Act = Callable[[Mapping[str, Any]], Mapping[str, Any]]
 """Maps the observations of all agents to their actions."""
 
 
+NODES = "nodes/"
+"""How names of nodes begin in a recording."""
+
+
 class Recording(NamedTuple):
     """One episode of T rows. Arrays of `seen` have one more row: after the last step."""
 
     seen: dict[str, np.ndarray]
     """[T + 1, ...] each: `observations/<agent>` in SI units, `state` of critics, `qpos` of the whole scene, `origin`
     and `quaternion` of all that moves but arms (`BatchedEnv.drawn_poses`), `objects`: position and quaternion of each
-    free object, [T + 1, k, 7]."""
+    free object, [T + 1, k, 7], and `nodes/<name>` of thread and tissue (`BatchedEnv.drawn_nodes`)."""
     done: dict[str, np.ndarray]
     """[T, ...] each: `actions/<agent>` in [-1, 1], `rewards/<agent>`, `success`, `terminated` and `truncated`."""
     place: tuple[int, int]
@@ -210,4 +214,5 @@ class _Recorder:
             | {"state": np.array(state), "qpos": np.array(env.qpos, np.float32)}
             | {"origin": np.array(drawn.origin, np.float32), "quaternion": np.array(drawn.quaternion, np.float32)}
             | {"objects": np.concatenate([free.origin, free.quaternion], -1).astype(np.float32)}
+            | {f"{NODES}{name}": np.array(nodes, np.float32) for name, nodes in env.drawn_nodes.items()}
         )

@@ -10,6 +10,8 @@ import numpy as np
 import pytest
 
 import surgical_marl as sm
+from surgical_marl.data.cameras import Cameras, find_pictures
+from surgical_marl.data.recording import Recording
 from surgical_marl.scenes.poses import Poses
 from surgical_marl.scenes.scene import Scene
 from surgical_marl.view.moment import Moment
@@ -167,6 +169,20 @@ def rays_depth(scene: Scene, triangles: np.ndarray) -> np.ndarray:
             depth = 1 / np.where(shares.sum(1) == 0, np.inf, shares.sum(1))
             found = np.where((shares >= -1e-9).all(1) & (depth > 0) & (depth < found), depth, found)
     return found.reshape(SIZE, SIZE)
+
+
+def test_pictures_of_a_data_set_show_the_surface() -> None:
+    """As it was in each row of a recording."""
+    scene = sm.load_scene("trimanual_psm_ecm_suture")
+    (skin,) = skins(scene.systems, scene.model)
+    poses = np.zeros((2, scene.model.nmocap, 3)), np.tile([1.0, 0.0, 0.0, 0.0], (2, scene.model.nmocap, 1))
+    nodes = np.stack([skin.rest, skin.rest + 0.01 * UP]).astype(np.float32)
+    seen = {"qpos": np.repeat(scene.home[None], 2, 0), "origin": poses[0], "quaternion": poses[1], "nodes/wound": nodes}
+    cameras = Cameras(scene, find_pictures(("endoscope", "outside_segmentation"), scene), (SIZE, SIZE))
+    (drawn,) = cameras.draw(Recording(seen, {}, (0, 0)))
+    wound = cameras.labels.index("wound")
+    assert all((found == wound).mean() > 1e-3 for found in drawn["outside_segmentation"])
+    assert (drawn["endoscope"][0] != drawn["endoscope"][1]).mean() > 0.01
 
 
 @pytest.mark.parametrize(
