@@ -60,9 +60,12 @@ def export(request: Request, out: Path) -> Path:
     part.mkdir(exist_ok=True)
     with owned(part, "exports into it"):
         begin(part, dataset.about)
-        _fill(request, source, dataset)
-        if not dataset.count:
-            raise ValueError("no episode is left to be exported: the takes hold no episode from its start")
+        try:
+            _fill(request, source, dataset)
+        except ValueError:
+            if not numbers(part):  # nothing to go on with
+                shutil.rmtree(part, ignore_errors=True)
+            raise
         whole = part / "whole"
         shutil.rmtree(whole, ignore_errors=True)
         whole.mkdir()
@@ -111,6 +114,8 @@ def _terms(request: Request, env: Env) -> tuple[int, str, tuple[Picture, ...]]:
     chosen, control_rate = FORMATS[request.format], round(1 / env.control_dt)
     rate, form = check_rate(request.rate, control_rate), request.actions or chosen.form
     check_form(form, env.options.control, control_rate // rate)
+    if request.actions and not chosen.chooses:
+        raise ValueError(f"format {request.format} holds joints and poses, both: leave --actions out")
     pictures = find_pictures(request.pictures, env.scene)
     for picture in pictures:
         if picture.channel not in chosen.channels:
@@ -131,7 +136,7 @@ def _dataset(request: Request, source: _Source, folder: Path) -> Dataset:
     own = source.settings
     environment = {**own.of_environment(), "task": label(own.task), "scene": scene_label(own.scene)}
     about = {
-        "format": request.format, "takes": {path.name: _digest(path) for path in request.takes},
+        "format": request.format, "takes": [[path.name, _digest(path)] for path in request.takes],
         "policy": None if request.takes else request.policy, "environment": environment,
         "engine": env.engine.name, "device": env.device, "episodes": request.episodes, "seed": own.seed,
         "rate": rate, "actions": form, "pictures": list(request.pictures), "size": list(request.size),
@@ -164,6 +169,9 @@ def _fill(request: Request, source: _Source, dataset: Dataset) -> None:
             if count == wanted:
                 break
     bar.close()
+    if not count:
+        which = "no whole episode that succeeds" if request.only_success else "no episode from its start"
+        raise ValueError(f"the takes hold {which}: nothing is exported")
 
 
 def check_rate(rate: int | None, control_rate: int) -> int:

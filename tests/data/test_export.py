@@ -279,6 +279,7 @@ def test_only_success(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(exporting, "TRIES", 4)
     with pytest.raises(ValueError, match=r"^0 of 4 episodes of 'zero' succeed: choose another policy"):
         export(request("robomimic", policy="zero", only_success=True, pictures=()), tmp_path / "none")
+    assert not (tmp_path / ".none.partial").exists()
 
 
 def test_takes_are_exported_in_any_form(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -298,10 +299,13 @@ def test_takes_are_exported_in_any_form(tmp_path: Path, capsys: pytest.CaptureFi
         assert file["data/demo_3/obs/outside_image"].shape == (6, 32, 32, 3)
         assert file["data/demo_3/actions"].shape == (6, 10)
     assert main([*command, "--out", str(tmp_path / "two"), "--episodes", "2"]) == 0
-    assert json.loads((tmp_path / "two/export.json").read_text())["takes"].keys() == {"take-0001.npz"}
+    assert json.loads((tmp_path / "two/export.json").read_text())["takes"][0][0] == "take-0001.npz"
     with h5py.File(tmp_path / "two/episodes.hdf5") as file:
         assert len(file["data"]) == 2
     capsys.readouterr()
+    assert main([*command, "--out", str(tmp_path / "none"), "--only-success"]) == 2
+    assert "the takes hold no whole episode that succeeds" in capsys.readouterr().err
+    assert not list(tmp_path.glob(".none*")), "there is nothing to go on with"
     assert main([*command, "--out", str(tmp_path / "new"), "--policy", "zero"]) == 2
     assert "a take says itself what it is of: leave out --policy" in capsys.readouterr().err
 
@@ -324,6 +328,7 @@ COMMAND = ["export", "episodes", "reach", "--scene", "psm", "--format", "robomim
         ([*COMMAND, "--rate", "30"], ["1, 2, 5, 10, 25 or 50", "30"]),
         ([*COMMAND, "--rate", "25"], ["--actions env", "--rate", "joint"]),
         ([*COMMAND, "--actions", "pose"], ["'pose'", "relative"]),
+        ([*COMMAND, "--format", "mcap", "--actions", "joint"], ["mcap", "leave --actions out"]),
         ([*COMMAND, "--actions", "joint", "--control", "torque", "--policy", "zero"], ["'torque'", "position"]),
         ([*COMMAND, "--policy", "nobody"], ["'nobody'", "oracle"]),
         ([*COMMAND, "--episodes", "0"], ["'0'"]),

@@ -24,6 +24,9 @@ class Format(NamedTuple):
     films: bool = False
     """Pictures are films of colours; otherwise arrays."""
     channels: tuple[str, ...] = ("rgb",)
+    """Of pictures that it can hold."""
+    chooses: bool = True
+    """Whether it has one form of states and actions, which is chosen; otherwise it has topics for several."""
 
     def check(self) -> None:
         """Raise ValueError if the package that writes the format is not installed."""
@@ -41,5 +44,5 @@ FORMATS = {
     "lerobot-2.1": Format("lerobot_2_1", "joint", "pyarrow", films=True),
     "minari": Format("minari", "env", "minari", channels=_ALL),
     "robomimic": Format("robomimic", "env", "h5py", channels=_ALL),
-    "mcap": Format("mcap", "joint", "rosbags"),
+    "mcap": Format("mcap", "joint", "rosbags", chooses=False),
 }
