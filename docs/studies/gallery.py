@@ -53,8 +53,8 @@ FIRST = "needle_handover"
 """The task on the first page."""
 COLUMNS = 4
 """Scenes in a row of the picture of all scenes, and cells in a row of the page."""
-FPS, SECONDS = 12.5, 6.0
-"""Frames a second of clips, and how long they are at most."""
+FPS, SECONDS, STAGED = 12.5, 6.0, 15.0
+"""Frames a second of clips, and how long they are at most; those of tasks with stages, which end once they are done."""
 QUALITY = 80
 """Of webp pictures, from 0 to 100."""
 ARM_AZIMUTH, ARM_ELEVATION = 219.0, -18.0
@@ -112,7 +112,7 @@ def clip(task: str, path: Path) -> str:
     settings = common_settings([who], {"task": task, "scene": scene, "goals": "training"})
     env = make_env(replace(settings, seed=0), 1, "numpy")
     look = Look(size=WIDE if task == FIRST else CLIP, fps=FPS)
-    shown = islice(pictures(env, Movers(env, who), look), round(FPS * SECONDS))
+    shown = islice(pictures(env, Movers(env, who), look), round(FPS * (STAGED if env.task.stages else SECONDS)))
     write_video(path, shown, FPS)
     env.close()
     return f"`{task}` on `{scene}`, moved by {'the oracle' if who == 'oracle' else f'`{who}`'}"

@@ -41,11 +41,15 @@ class Caption(NamedTuple):
     colour: Rgb = WHITE
 
 
+_FORCES = "tissue_force", "tension"
+"""What systems report that a film says: all else would make letters too small."""
+
+
 class Captions:
     """Reads the captions of environments, step by step."""
 
     def __init__(self, env: BatchedEnv) -> None:
-        self._env, self._reports = env, reported(env.scene)
+        self._env, self._forces = env, [name for name in reported(env.scene) if name in _FORCES]
         self._reached: list[set[str]] = [set() for _ in range(env.num_envs)]
 
     def read(self, infos: Mapping[str, Mapping[str, Any]], index: int) -> list[Caption]:
@@ -61,9 +65,9 @@ class Captions:
             found.append(Caption(f"{agent}  {', '.join(words)}", colour_of(number)))
         if any(_true(own, name, index) for own in infos.values() for name in _FAULTS):
             found[0] = found[0]._replace(colour=RED)
-        for name in self._reports:
+        for name in self._forces:
             value = float(np.asarray(infos[env.agents[0]][name])[index])
-            found.append(Caption(f"{name.replace('_', ' ')}  {value:.2f}", GREY))
+            found.append(Caption(f"{name.replace('_', ' ')}  {value:.2f} N", GREY))
         for name in env.task.stages:
             done = name in reached
             found.append(Caption(f"{'+' if done else '-'} {name.replace('_', ' ')}", WHITE if done else GREY))

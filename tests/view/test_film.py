@@ -48,7 +48,7 @@ def test_words_of_a_panel_have_their_colours() -> None:
 def test_stages_stay_reached_until_an_episode_ends() -> None:
     task = SimpleNamespace(stages=("lifted", "placed"))
     steps, agents = np.array([7, 7]), ("psm_0", "psm_1")
-    thread = SimpleNamespace(reports=("tension",))
+    thread = SimpleNamespace(reports=("tension", "swept"))
     scene = SimpleNamespace(systems={"thread": thread, "other thread": thread})
     env: Any = SimpleNamespace(
         num_envs=2, agents=agents, steps=steps, control_dt=0.02, task_name="peg_transfer", task=task, scene=scene
@@ -61,11 +61,11 @@ def test_stages_stay_reached_until_an_episode_ends() -> None:
         own |= {"success": np.array([success] * 2), "drop": np.array([dropped] * 2)}
         return [text for text, _ in captions.read(dict.fromkeys(env.agents, own), index)]
 
-    start = ["0.14 s  peg_transfer", "psm_0  ", "psm_1  ", "tension  0.50", "- lifted", "- placed", ""]
+    start = ["0.14 s  peg_transfer", "psm_0  ", "psm_1  ", "tension  0.50 N", "- lifted", "- placed", ""]
     assert texts(0, [False, False]) == start
     assert texts(0, [True, False])[4:] == ["+ lifted", "- placed", ""]
     assert texts(0, [False, False], success=True)[4:] == ["+ lifted", "- placed", "success"]
-    assert texts(1, [False, False], dropped=True)[1:5] == ["psm_0  drop", "psm_1  drop", "tension  0.25", "- lifted"]
+    assert texts(1, [False, False], dropped=True)[1:5] == ["psm_0  drop", "psm_1  drop", "tension  0.25 N", "- lifted"]
     captions.forget(np.array([True, False]))
     assert texts(0, [False, False]) == start
 
