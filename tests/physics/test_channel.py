@@ -130,6 +130,25 @@ def test_a_curved_needle_has_the_friction_of_its_length_too(sewn: tuple[TissueSt
     assert along.mean() == pytest.approx(SET.friction * length(state), rel=0.02)
 
 
+def test_a_needle_sweeps_as_far_as_it_went_not_as_it_was_expected_to(pierced: tuple[TissueState, Seen]) -> None:
+    """The pin is expected to go aside by 0.25 mm, as one that trembles is in each step."""
+    channels, fast = TISSUE.channels, jnp.zeros((2, 6)).at[0, 0].set(0.1)
+    assert channels
+
+    @jax.jit
+    def swept(state: TissueState, share: float) -> jax.Array:
+        bodies = bodies_at(np.array([below(-0.004), [0.3, 0.3, 0.3]]), velocity=fast)
+        state, ends = TISSUE.follow(state, no_ends(TISSUE), bodies, DT)
+        assert state.channels
+        after = channels.remember(
+            state.channels, ends, lambda row, end: jnp.zeros(3), lambda row, end: share * end.shift
+        )
+        return after.swept[0]
+
+    still, moved = (float(swept(pierced[0], share) - pierced[0].channels.swept[0]) for share in (0.0, 1.0))
+    assert still == 0 and moved == pytest.approx(2.5e-4, rel=1e-3)
+
+
 def test_off_its_arc_a_needle_costs_work_and_gives_none(sewn: tuple[TissueState, Seen]) -> None:
     """On a way that ends where it began, whatever the tissue gives back was put in before."""
     state, before = sewn

@@ -103,22 +103,29 @@ class Channels:
         pressed = feel(end._replace(bilateral=end.bilateral & (end.part < self.first)), moved)
         return jax.tree.map(lambda a, b: jnp.where(touches, a, b), pressed, hold(end, moved))
 
-    def remember(self, state: ChannelState, ends: Ends, moved: Any) -> ChannelState:
-        """Return the state after a step in which points of rows move by `moved(row, end)` relative to needles, m."""
+    def remember(self, state: ChannelState, ends: Ends, moved: Any, went: Any) -> ChannelState:
+        """Return the state after a step.
+
+        Points of rows move by `moved(row, end)` relative to needles, m, and needles there by `went(row, end)`.
+        """
         c, n = self.about.most, len(self.needles)
 
         def note(row: Array, found: Any) -> Any:
             end = row_of(ends.rows, row)
-            felt = self.feel(end, moved(row, end))
+            felt, way, inside = self.feel(end, moved(row, end)), went(row, end), end.stiffness / self.about.stiffness
+            aside = way - end.normal * (end.normal @ way)
             part = jnp.where(self.own(end), end.part - self.first, c * POINTS + 2 * n)
-            return put(found, part, (felt.stretch, felt.force @ end.normal, end.normal @ felt.stretch))
+            return put(found, part, (felt.stretch, felt.force @ end.normal, end.normal @ felt.stretch,
+                                     inside * jnp.sqrt(aside @ aside), inside))  # fmt: skip
 
         size = c * POINTS + 2 * n + 1
-        start = jnp.zeros((size, 3)), jnp.zeros(size), jnp.zeros(size)
-        stretch, force, slip = jax.lax.fori_loop(0, ends.moving, note, start)
+        start = jnp.zeros((size, 3)), *[jnp.zeros(size)] * 4
+        stretch, force, *of_places = jax.lax.fori_loop(0, ends.moving, note, start)
+        slip, way, inside = (x[: c * POINTS].reshape(c, POINTS) for x in of_places)
         cuts, presses = slice(c * POINTS, c * POINTS + n), slice(c * POINTS + n, c * POINTS + 2 * n)
         tips = state.tips._replace(stretch=stretch[cuts] + stretch[presses], pressed=force[presses])
-        return state._replace(slip=slip[: c * POINTS].reshape(c, POINTS), tips=tips)
+        swept = state.swept + way.sum(1) / jnp.maximum(inside.sum(1), 1e-9)
+        return state._replace(slip=slip, swept=swept, tips=tips)
 
     # -- a step begins
 
@@ -147,7 +154,7 @@ class Channels:
         def of_needle(n: Array, now: tuple[ChannelState, Ends]) -> tuple[ChannelState, Ends]:
             arc = row_of(arcs, n)
             state, refused = Advance(self._punctures, n, arc, position).after(now[0])
-            state, found = self._of_needle(state, n, arc, position, now[1], row_of(bodies, n), dt)
+            found = self._of_needle(state, n, arc, position, now[1], row_of(bodies, n), dt)
             return state, found._replace(left_out=found.left_out + refused)
 
         state, found = jax.lax.fori_loop(0, len(self.needles), of_needle, (state, start))
@@ -165,7 +172,7 @@ class Channels:
 
     def _of_needle(
         self, state: ChannelState, n: Array, arc: Arc, position: Array, ends: Ends, body: Followed, dt: Any
-    ) -> tuple[ChannelState, Ends]:
+    ) -> Ends:
         """Return contacts with those of one needle's channels and of its tip."""
 
         def row(part: Any, place: Array, **rest: Any) -> End:
@@ -174,11 +181,8 @@ class Channels:
             own = still._replace(part=jnp.int32(part), shape=jnp.int32(body.shape), bilateral=jnp.bool_(True))
             return own._replace(place=place, shift=shift, **rest)
 
-        def of_channel(c: Array, found: tuple[ChannelState, Ends]) -> tuple[ChannelState, Ends]:
-            state, ends = found
-
-            def of_place(i: Array, found: tuple[Ends, Array, Array]) -> tuple[Ends, Array, Array]:
-                ends, length, way = found
+        def of_channel(c: Array, ends: Ends) -> Ends:
+            def of_place(i: Array, ends: Ends) -> Ends:
                 place = self.material.place(position, state.places[c, i])
                 s = behind(self.material, state, c, i, arc, position)
                 foot, tangent = arc.point(s)
@@ -190,19 +194,15 @@ class Channels:
                     stiffness=self.about.stiffness * inside, sliding=bound,
                     stretch=off + (state.slip[c, i] - tangent @ off) * tangent,
                 )  # fmt: skip
-                aside = end.shift - tangent * (tangent @ end.shift)
-                return _after(ends, end, inside > 0, True), length + inside, way + inside * jnp.sqrt(aside @ aside)
+                return _after(ends, end, inside > 0, True)
 
-            start = ends, jnp.float32(0.0), jnp.float32(0.0)
-            ends, length, way = jax.lax.fori_loop(0, state.total[c], of_place, start)
-            swept = state.swept.at[c].add(way / jnp.maximum(length, 1e-9), mode="promise_in_bounds")
-            return state._replace(swept=swept), ends
+            found: Ends = jax.lax.fori_loop(0, state.total[c], of_place, ends)
+            return found
 
-        def of_own(c: Array, found: tuple[ChannelState, Ends]) -> tuple[ChannelState, Ends]:
-            mine = found[0].needle[c] == n
-            return jax.lax.cond(mine, lambda found: of_channel(c, found), lambda found: found, found)
+        def of_own(c: Array, ends: Ends) -> Ends:
+            return jax.lax.cond(state.needle[c] == n, lambda ends: of_channel(c, ends), lambda ends: ends, ends)
 
-        state, ends = jax.lax.fori_loop(0, self.about.most, of_own, (state, ends))
+        ends = jax.lax.fori_loop(0, self.about.most, of_own, ends)
         tips = row_of(state.tips, n)
         place, inwards = self.material.surface(position, tips.face, tips.touch)
         presses = row(
@@ -215,7 +215,7 @@ class Channels:
             stretch=(tips.stretch @ arc.along) * arc.along,
         )  # fmt: skip
         end = jax.tree.map(lambda a, b: jnp.where(tips.does == CUTS, a, b), cuts, presses)
-        return state, _after(ends, end, tips.does != FREE, True)
+        return _after(ends, end, tips.does != FREE, True)
 
     def _with_others(
         self, state: ChannelState, arcs: Arc, position: Array, found: Ends, ends: Ends, bodies: Followed

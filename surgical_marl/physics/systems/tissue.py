@@ -283,12 +283,15 @@ class Tissue(Soft, SkinnedSystem):
         pushed = pushes(ends, answer.falls, accelerations, dt)
         after = self._step(dt).move(state.nodes, held, ends, answer, pushed)
 
+        def went(row: Array, end: End) -> Array:
+            return end.shift + dt * dt * accelerations[row]
+
         def moved(row: Array, end: End) -> Array:
-            return after.points[row] - end.shift - dt * dt * accelerations[row]
+            return after.points[row] - went(row, end)
 
         stretches, channels = remember(ends, moved, len(self.points.nodes)), state.channels
         if self.channels and channels:
-            channels = self.channels.remember(channels, ends, moved)
+            channels = self.channels.remember(channels, ends, moved, went)
         nodes, torn = Nodes(after.position, after.velocity), state.torn | after.torn
         return TissueState(nodes, stretches, *hardest(ends, answer.force), torn, channels)
 
