@@ -180,13 +180,24 @@ def test_what_is_drawn_is_where_it_is(viewer: Viewer) -> None:
     np.testing.assert_allclose(nodes._lines.points[0], moment.nearest[0].ends, atol=1e-6)
 
 
+class Camera(SimpleNamespace):
+    """As viser's: who moves it moves the point that it looks at too."""
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        if name == "position":
+            self.__dict__["look_at"] = self.look_at + value - self.position
+        self.__dict__[name] = value
+
+
 def test_a_page_as_narrow_as_a_phones_looks_from_farther_away(viewer: Viewer) -> None:
     first = viewer.server.initial_camera
     away = np.asarray(first.position) - first.look_at
     for aspect, wider in ((0.5, 2.0), (1.5, 1.0)):
-        client: Any = SimpleNamespace(camera=SimpleNamespace(aspect=aspect, position=np.asarray(first.position)))
+        begin = {"position": np.asarray(first.position), "look_at": np.asarray(first.look_at)}
+        client: Any = SimpleNamespace(camera=Camera(aspect=aspect, **begin))
         viewer._stand_back(client)
         np.testing.assert_allclose(client.camera.position - first.look_at, wider * away, atol=1e-6)
+        np.testing.assert_allclose(client.camera.look_at, first.look_at, atol=1e-6)
 
 
 def test_what_can_not_be_done_changes_nothing(viewer: Viewer) -> None:

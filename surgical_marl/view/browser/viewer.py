@@ -135,6 +135,7 @@ class Viewer:
         if wider > 1:
             look_at = np.asarray(first.look_at)
             client.camera.position = look_at + wider * (np.asarray(first.position) - look_at)
+            client.camera.look_at = look_at  # which has moved with it
 
     def _do(self, act: Callable[[], None]) -> None:
         try:
