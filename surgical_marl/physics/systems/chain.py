@@ -248,27 +248,6 @@ def solve(rod: Rod, factors: Factors, force: Array, holds: Any) -> Array:
     return _back(rod, bends, factors, reduced)[0]
 
 
-def compliances(rod: Rod, factors: Factors, holds: Any) -> tuple[Array, Array]:
-    """Return how far each node moves by a force on it, m/N, [n, 3, 3], and the same of the next node, [n, 3, 3].
-
-    These are the blocks of the inverse matrix on its diagonal and beside it, from the last node back to the first
-    (Takahashi, Fagan and Chin 1973). Row i of the second is the motion of node i by a force on node i + 1.
-    """
-
-    def node(carry: tuple[Array, Array, Array], row: Any) -> tuple[tuple[Array, Array, Array], tuple[Array, Array]]:
-        (next_1, beside, next_2), (factor, skip) = carry, row
-        own, one = factor.own[FULL], factor.one.T
-        by_next = -(one @ next_1 + skip * own @ beside.T)
-        by_second = -(one @ beside + skip * own @ next_2)
-        itself = own - by_next @ one.T - skip * by_second @ own
-        return (itself, by_next, next_1), (itself, by_next)
-
-    none = jnp.zeros((3, 3))
-    rows = factors, _skips(rod, holds * _before(holds))
-    found: tuple[Array, Array] = jax.lax.scan(node, (none, none, none), rows, reverse=True)[1]
-    return found
-
-
 def _eliminate(
     rod: Rod, u: Array, q: Array, edges: Array, known: tuple[Any, ...], load: Loaded
 ) -> tuple[Factors, Array]:  # fmt: skip

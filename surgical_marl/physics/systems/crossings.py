@@ -222,17 +222,6 @@ def add(pairs: Ends, u: Array, own: Joined, change: Array) -> Array:
     return found
 
 
-def stiffer(pairs: Ends, u: Array, own: Joined, part: Array, share: Array) -> Array:
-    """Return by how much less the point of a part moves by a force on it than without pairs, m/N, [3, 3]."""
-    seen = jax.lax.map(lambda moves: _at(moves[:, :3], part, share), own.moves)  # as pairs see a unit force there
-
-    def one(force: Array) -> Array:
-        weights: Array = solve_factored(own.factor, seen @ force)
-        return weights @ seen
-
-    return jax.lax.cond(pairs.total > 0, lambda: jax.lax.map(one, jnp.eye(3)), lambda: jnp.zeros((3, 3)))
-
-
 def _roots(pairs: Ends, u: Array) -> Array:
     """Return the roots of the stiffnesses of pairs, [p, 3, 3]."""
 

@@ -192,9 +192,6 @@ class Response(NamedTuple):
     falls: Array | None = None
     """By how much the force on each end falls as that end moves, N/m: lower halves, [c, 6]. None if the motion of one
     end changes the forces on others, as `yielding` says then."""
-    alone: Array | None = None
-    """In that case, by how much the force on each end falls as that end alone moves: the blocks on the diagonal of what
-    `yielding` multiplies by. None if they are to be found by `yielding`. Only those of skins count."""
 
 
 class Skin(NamedTuple):

@@ -29,7 +29,6 @@ from surgical_marl.physics.systems.chain import (
     Loaded,
     Newton,
     Rod,
-    compliances,
     free_forces,
     moved,
     search,
@@ -229,30 +228,7 @@ class Thread(Soft):
             return -force, felt.stiffness[LOWER]
 
         force, falls = each(ends, at_end, moving=True)
-        solved = Solved(found, ends, pairs, falls, holds)
-        return Response(force, solved, pairs.left_out, alone=self._alone(solved))
-
-    def _alone(self, solved: Solved) -> Array | None:
-        """Return how the forces on ends fall as each end moves alone, [c, 6], if a skin is touched: 0 elsewhere."""
-        ends, newton = solved.ends, solved.newton
-        if ends.rows.on is None:
-            return None
-
-        def of_skins() -> Array:
-            itself, by_next = compliances(self.rod, newton.factors, solved.holds)
-
-            def fall(row: Array, end: End) -> Array:
-                first, second, falls = 1 - end.share, end.share, solved.falls[row][FULL]
-                across = first * second * by_next[end.part]
-                gives = first * first * itself[end.part] + second * second * itself[end.part + 1] + across + across.T
-                gives -= crossings.stiffer(solved.pairs, newton.shift, newton.joined, end.part, end.share)
-                return (falls - falls @ gives @ falls)[LOWER]
-
-            found: Array = each(ends, fall, moving=True)
-            return found
-
-        touches = (ends.moving > 0) & (ends.rows.shape[0] < 0)
-        return jax.lax.cond(touches, of_skins, lambda: jnp.zeros_like(solved.falls))
+        return Response(force, Solved(found, ends, pairs, falls, holds), pairs.left_out)
 
     def yielding(self, response: Response, ends: Ends, accelerations: Array, dt: Any) -> Array:
         pushed, change = self._carried(response.solved, accelerations, dt)
