@@ -47,8 +47,8 @@ acceleration, which is stable for a needle and a jaw of 0.7 kg while all between
 
 APART = 2.5
 """Factor of the stiffness of a contact that moves alone, with which a skin reckons. Contacts that move apart from
-others are stiffer: twice along a chain, 2.8 times across one that resists bending. The step of a light skin is stable if
-it takes them for 3/4 as stiff as they are, or more."""
+others are stiffer: twice along a chain, 2.8 times across one that resists bending. The step of a light skin is stable
+if it takes them for 3/4 as stiff as they are, or more."""
 
 
 class Sewing(NamedTuple):
