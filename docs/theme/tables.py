@@ -183,7 +183,8 @@ class Card:
         self.link = f"[`{name}`](policies/{name}/README.md)"
         self.result = result = evaluation["seeds"]["aggregate"]
         self.task, self.level, self.episodes = result["task"], result["difficulty"], result["episodes"]
-        self.objects = bool(load_scene(result["scene"]).free_objects)
+        scene = load_scene(result["scene"])
+        self.objects = bool(scene.free_objects or scene.systems)
         self.seeds, self.imitated = len(runs), read_settings(folder).shown_by_oracle
         self.seconds = sum(row["seconds"] for row in read_metrics(folder))
         self.on_gpu = "NVIDIA" in str(origin.get("device"))
