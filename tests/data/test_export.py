@@ -8,6 +8,7 @@ from itertools import islice
 from pathlib import Path
 from typing import Any
 
+import gymnasium
 import numpy as np
 import pytest
 
@@ -181,6 +182,8 @@ def test_minari_makes_the_environment_again(tmp_path: Path) -> None:
     env = found.recover_environment()
     assert env.action_space == found.action_space and env.observation_space == found.observation_space
     assert env.observation_space.contains(found[0].observations[3])
+    registered = gymnasium.spec("surgical_marl/Reach-v0")
+    assert registered.max_episode_steps != found.env_spec.max_episode_steps and "knowledge" not in registered.kwargs
 
 
 def test_robomimic(tmp_path: Path, truth: Any) -> None:

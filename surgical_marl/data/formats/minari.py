@@ -8,6 +8,7 @@ observation is a dict of `proprioception` and the pictures.
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -89,7 +90,7 @@ def _spec(dataset: Dataset) -> Any:
     words = "".join(word.capitalize() for word in options.task.split("_"))
     kept = ("control", "control_frame", "difficulty", "goals", "start", "knowledge", "messages", "observations")
     with_env = {"scene": dataset.about["environment"]["scene"], **{name: getattr(options, name) for name in kept}}
-    spec = gymnasium.spec(f"surgical_marl/{words}-v0")
+    spec = copy.deepcopy(gymnasium.spec(f"surgical_marl/{words}-v0"))  # what others make stays as it is
     spec.kwargs.update(with_env)
     spec.max_episode_steps = dataset.env.max_steps
     return spec
