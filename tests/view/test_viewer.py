@@ -367,5 +367,5 @@ def test_a_run_before_its_first_checkpoint_is_bad_input(
 
 def test_a_policy_brings_its_scene() -> None:
     arguments = _parser().parse_args(["play", "reach", "--policy", "reach-star", "--out", "film.gif"])
-    settings, who = viewing._settings(arguments)
+    settings, who = viewing.settings_of(arguments)
     assert (settings.task, settings.scene, who) == ("reach", "star", "reach-star")
