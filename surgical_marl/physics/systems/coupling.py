@@ -339,7 +339,7 @@ class Coupling:
             return jnp.where(row_of(ends.rows, row).shape == -1 - number, row + 1, found)
 
         used: Array = jax.lax.fori_loop(0, ends.moving, last, jnp.int32(0))
-        falls = response.falls if response.falls is not None else APART * self._alone(response, ends, used, dt)
+        falls = response.falls if response.falls is not None else self._apart(response, ends, used, dt)
 
         def spring(row: Array, end: End) -> tuple[Any, ...]:
             spot, mine, stiffness = _spot(end, number), end.shape == -1 - number, falls[row]
@@ -349,8 +349,8 @@ class Coupling:
         nodes, weights, force, stiffness = each(ends._replace(moving=used), spring, moving=True)
         return Springs(nodes, weights, force, stiffness, used)
 
-    def _alone(self, response: Response, ends: Ends, count: Array, dt: Any) -> Array:
-        """Return by how much the force on each of the first ends falls as that end alone moves, N/m, [c, 6]."""
+    def _apart(self, response: Response, ends: Ends, count: Array, dt: Any) -> Array:
+        """Return `APART` times by how much the force on each of the first ends falls as it alone moves, N/m, [c, 6]."""
 
         def fall(row: Array, end: End) -> Array:
             del end
@@ -359,8 +359,7 @@ class Coupling:
                 accelerations = jnp.zeros_like(response.force).at[row].set(axis / (dt * dt))
                 return self._system.yielding(response, ends, accelerations, dt)[row]
 
-            found: Array = jax.lax.map(along, jnp.eye(3))
-            return found[LOWER]
+            return APART * jax.lax.map(along, jnp.eye(3))[LOWER]
 
         found: Array = each(ends._replace(moving=count), fall, moving=True)
         return found

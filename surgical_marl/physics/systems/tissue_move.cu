@@ -2,7 +2,7 @@
 __shared__ float x[3 * NODES];
 const int rows = in.total[0], moving = in.moving[0];
 
-hold(in.total[0]);
+hold(rows);
 hang(rows);
 if (moving > 0) {
     for (int k = thread; k < 3 * ROOM; k += threads) pull[k] = k < 3 * moving ? in.pushed[k] : 0.0f;
