@@ -234,14 +234,12 @@ class Task(NeedleDrive):
             return jnp.where(counts, jnp.where(before < 0, value, jnp.minimum(value, before)), before)
 
         share = jnp.where(sewn.out, 1.0, now.out / self.needle.length)
-        off = known(jnp.abs(sewn.tail - self.tables["tails"][world.goal.row]))
-        right = sewn.out & (off < self.level.tail)
         return Stitch(
             least(sewn.meet, stitch.meet, ready & ~sewn.out),
             jnp.maximum(stitch.take, as_float(sewn.partner & ready)),
             jnp.where(good, jnp.maximum(stitch.draw, share), stitch.draw),
-            least(off, stitch.pull, good & sewn.out & sewn.partner),
-            jnp.maximum(stitch.back, as_float(good & right & sewn.returned)),
+            least(known(self._off(world, sewn)), stitch.pull, good & sewn.out & sewn.partner),
+            jnp.maximum(stitch.back, as_float(self._right(world, now, sewn) & sewn.returned)),
             jnp.maximum(stitch.force, world.systems[self.tissue].tissue_force),
             jnp.maximum(stitch.tension, jnp.max(world.systems[self.thread].tension)),
         )
@@ -255,10 +253,13 @@ class Task(NeedleDrive):
         sewn = self.sewn(world)
         return super().remember(world)._replace(stitch=self.further(world, self.now(world), sewn), tail=sewn.tail)
 
+    def _off(self, world: World, sewn: Sewn) -> Array:
+        """Return by how much the tail's length is off, m."""
+        return jnp.abs(sewn.tail - self.tables["tails"][world.goal.row])
+
     def _right(self, world: World, now: Now, sewn: Sewn) -> Array:
         """Return whether a stitch within the tolerance has a tail within its own."""
-        off = jnp.abs(sewn.tail - self.tables["tails"][world.goal.row])
-        return self._good(now) & sewn.out & (off < self.level.tail)
+        return self._good(now) & sewn.out & (self._off(world, sewn) < self.level.tail)
 
     def _done(self, world: World, now: Now, sewn: Sewn) -> Array:
         """Return whether the stitch is done, and neither tissue nor thread was overloaded."""
@@ -314,7 +315,7 @@ class Task(NeedleDrive):
     def metrics(self, world: World) -> dict[str, dict[str, Array]]:
         """Return those of `needle_drive`, `tail_error` and `gap`, m."""
         sewn = self.sewn(world)
-        more = {"tail_error": jnp.abs(sewn.tail - self.tables["tails"][world.goal.row]), "gap": sewn.gap}
+        more = {"tail_error": self._off(world, sewn), "gap": sewn.gap}
         return {agent: {**found, **more} for agent, found in super().metrics(world).items()}
 
     # -- what agents observe
