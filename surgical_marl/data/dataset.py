@@ -45,7 +45,7 @@ class Episode(NamedTuple):
     pictures: dict[str, np.ndarray]
     """[T + 1, H, W, C] each, by name; none where they are films."""
     levels: dict[str, np.ndarray]
-    """How often each level of a colour is there in some of the frames of a film, [3, 256] each, by name."""
+    """Counts of each level of each colour in some of the frames of a film, [3, 256] each, by name."""
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,7 @@ class Dataset:
     size: tuple[int, int] = (0, 0)
     """Width and height of pictures, pixels."""
     about: Mapping[str, Any] = field(default_factory=dict)
-    """What is exported, as the user asked for it."""
+    """The export, as the user asked for it."""
 
     @property
     def robot(self) -> str:

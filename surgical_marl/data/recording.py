@@ -27,7 +27,7 @@ Act = Callable[[Mapping[str, Any]], Mapping[str, Any]]
 
 
 NODES = "nodes/"
-"""How names of nodes begin in a recording."""
+"""Prefix of the names of nodes in a recording."""
 
 
 class Recording(NamedTuple):
@@ -47,8 +47,13 @@ class Recording(NamedTuple):
 
     @property
     def succeeded(self) -> bool:
-        """Whether all agents succeed at the end."""
+        """True if all agents succeed at the end."""
         return bool(self.done["success"][-1])
+
+    @property
+    def ended(self) -> np.ndarray:
+        """True of the last row, and of one that ends the task, [T] bool."""
+        return np.asarray(self.done["terminated"] | (np.arange(len(self)) == len(self) - 1))
 
     @property
     def reward(self) -> np.ndarray:

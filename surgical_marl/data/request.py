@@ -1,4 +1,4 @@
-"""What can be asked of an export of episodes."""
+"""An export of episodes as it is asked for, and the names that it may use."""
 
 from __future__ import annotations
 

@@ -26,7 +26,7 @@ class Format(NamedTuple):
     channels: tuple[str, ...] = ("rgb",)
     """Of pictures that it can hold."""
     chooses: bool = True
-    """Whether it has one form of states and actions, which is chosen; otherwise it has topics for several."""
+    """True if it has one form of states and actions, which is chosen; otherwise it has topics for several."""
 
     def check(self) -> None:
         """Raise ValueError if the package that writes the format is not installed."""

@@ -45,13 +45,14 @@ def write(dataset: Dataset, out: Path) -> None:
             held.clear()
 
     for episode in dataset:
-        table = table_of(columns(dataset, episode, rows))
+        values = columns(dataset, episode, rows)
+        table = table_of(values)
         if size + table.nbytes > DATA_MB * 2**20:
             flush()
             file, size = file + 1, 0
         held.append(table)
         size += table.nbytes
-        stats = episode_stats(dataset, episode)
+        stats = episode_stats(values, episode.levels)
         episodes.append(_about(dataset, episode, rows, file, stats))
         every.append(stats)
         rows += len(table)
@@ -104,14 +105,14 @@ def features(dataset: Dataset) -> dict[str, Any]:
 def columns(dataset: Dataset, episode: Episode, first: int) -> dict[str, np.ndarray]:
     """Return the rows of an episode by their names, [T, ...] each; `first` is the number of the first one."""
     recording = episode.recording
-    count, done = len(recording), recording.done
+    count = len(recording)
     return {
         "observation.state": dataset.signals.state(recording)[:-1],
         "observation.environment_state": recording.seen["state"][:-1].astype(np.float32),
         "action": dataset.signals.action(recording),
         "next.reward": recording.reward,
-        "next.done": done["terminated"] | (np.arange(count) == count - 1),
-        "next.success": done["success"],
+        "next.done": recording.ended,
+        "next.success": recording.done["success"],
         "timestamp": (np.arange(count) / dataset.rate).astype(np.float32),
         "frame_index": np.arange(count),
         "episode_index": np.full(count, episode.number),
@@ -129,16 +130,19 @@ def table_of(values: Mapping[str, np.ndarray]) -> pa.Table:
     return pa.table(found)
 
 
-def episode_stats(dataset: Dataset, episode: Episode) -> Stats:
-    """Return statistics of an episode's values, by their names; of pictures [3, 1, 1] each, of colours from 0 to 1."""
+def episode_stats(values: Mapping[str, np.ndarray], levels: Mapping[str, np.ndarray]) -> Stats:
+    """Return statistics of an episode's columns [T, ...] and of its pictures, by their names.
+
+    Those of pictures are [3, 1, 1] each, of colours from 0 to 1; `levels` are those of `Episode`.
+    """
     found = {}
-    for key, column in columns(dataset, episode, 0).items():
-        values = column.reshape(len(column), -1).astype(float)
-        found[key] = {"min": values.min(0), "max": values.max(0), "mean": values.mean(0), "std": values.std(0)}
-        found[key] |= {name: np.quantile(values, share, axis=0) for name, share in QUANTILES.items()}
-        found[key]["count"] = np.array([len(values)])
-    for name, levels in episode.levels.items():
-        found[IMAGES + name] = _picture_stats(levels)
+    for key, column in values.items():
+        rows = column.reshape(len(column), -1).astype(float)
+        found[key] = {"min": rows.min(0), "max": rows.max(0), "mean": rows.mean(0), "std": rows.std(0)}
+        found[key] |= {name: np.quantile(rows, share, axis=0) for name, share in QUANTILES.items()}
+        found[key]["count"] = np.array([len(rows)])
+    for name, counts in levels.items():
+        found[IMAGES + name] = _picture_stats(counts)
     return found
 
 

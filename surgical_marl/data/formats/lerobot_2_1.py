@@ -36,7 +36,8 @@ def write(dataset: Dataset, out: Path) -> None:
     """Write a data set into a new folder."""
     rows, episodes, every = 0, [], []
     for episode in dataset:
-        table, number = table_of(columns(dataset, episode, rows)), episode.number
+        values, number = columns(dataset, episode, rows), episode.number
+        table = table_of(values)
         path = out / "data" / _chunk(number) / f"episode_{number:06d}.parquet"
         path.parent.mkdir(parents=True, exist_ok=True)
         pq.write_table(table, path)
@@ -44,7 +45,7 @@ def write(dataset: Dataset, out: Path) -> None:
             folder = out / "videos" / _chunk(number) / (IMAGES + picture.name)
             copy_film(dataset, number, picture.name, folder / f"episode_{number:06d}.mp4")
         episodes.append({"episode_index": number, "tasks": [dataset.language], "length": len(table)})
-        every.append(episode_stats(dataset, episode))
+        every.append(episode_stats(values, episode.levels))
         rows += len(table)
     meta = out / "meta"
     meta.mkdir()

@@ -50,22 +50,19 @@ def write(dataset: Dataset, out: Path) -> None:
 
 def _add(dataset: Dataset, episode: Episode, group: Any) -> None:
     recording = episode.recording
-    seen, done = recording.seen, recording.done
+    seen = recording.seen
     observed = {
         "state": dataset.signals.state(recording),
         "environment_state": seen["state"],
         **{f"{name}_image": values for name, values in episode.pictures.items()},
     }
     for name, values in observed.items():
-        packed: dict[str, Any] = (
-            {"compression": "gzip", "compression_opts": 1} if name in observed and values.ndim > 2 else {}
-        )
+        packed: dict[str, Any] = {"compression": "gzip", "compression_opts": 1} if values.ndim > 2 else {}
         group.create_dataset(f"obs/{name}", data=values[:-1], **packed)
         group.create_dataset(f"next_obs/{name}", data=values[1:], **packed)
     group["actions"] = dataset.signals.action(recording)
     group["rewards"] = recording.reward
-    last = np.arange(len(recording)) == len(recording) - 1
-    group["dones"] = (done["terminated"] | last).astype(np.int64)
+    group["dones"] = recording.ended.astype(np.int64)
     objects = seen["objects"].reshape(len(seen["objects"]), -1)
     group["states"] = np.concatenate([seen["qpos"], objects], 1)[:-1]
 
