@@ -58,6 +58,17 @@ def text(vector: bool, function: Any = function, columns: Any = COLUMNS) -> str:
     return compile_program(Program(graph, stores, vector)).text
 
 
+def check_results(function: Any, columns: Any, rtol: float) -> None:
+    """Compare what kernels for a CPU and for a GPU compute with what JAX does."""
+    expected = jax.jit(jax.vmap(function))(*columns)
+    found = [run(function, *columns)]
+    with gpu_code():
+        found.append(run(function, *columns))
+    for one in found:
+        for a, b in zip(one, expected, strict=True):
+            np.testing.assert_allclose(a, b, rtol=rtol)
+
+
 @pytest.mark.parametrize("name", SWITCHES)
 def test_code_without_a_pass_is_other_code(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     graph, *_ = make_stores(function, COLUMNS)
@@ -80,14 +91,8 @@ def test_paths_are_noted_only_where_work_is(monkeypatch: pytest.MonkeyPatch) -> 
 
 
 def test_code_without_any_pass_computes_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
-    expected = jax.jit(jax.vmap(function))(*COLUMNS)
     monkeypatch.setenv(PASSES, ",".join(f"-{name}" for name in SWITCHES))
-    found = [run(function, *COLUMNS)]
-    with gpu_code():
-        found.append(run(function, *COLUMNS))
-    for one in found:
-        for a, b in zip(one, expected, strict=True):
-            np.testing.assert_allclose(a, b, rtol=1e-5)
+    check_results(function, COLUMNS, 1e-5)
 
 
 def test_fields_in_a_row_are_moved_by_loops() -> None:
@@ -102,13 +107,7 @@ def test_fields_in_a_row_are_moved_by_loops() -> None:
         code = text(vector, changed, columns)
         assert "LDF(state,0+(1)*k)" in code and "=LDF(state,6);" in code
         assert len([line for line in code.splitlines() if "STF(" in line and "+(1)*k,v" in line]) == 1
-    expected = jax.jit(jax.vmap(changed))(*columns)
-    found = [run(changed, *columns)]
-    with gpu_code():
-        found.append(run(changed, *columns))
-    for one in found:
-        for a, b in zip(one, expected, strict=True):
-            np.testing.assert_allclose(a, b, rtol=1e-6)
+    check_results(changed, columns, 1e-6)
 
 
 @pytest.mark.parametrize("word", ["interleave", "-place", "-interleaving", "-"])
