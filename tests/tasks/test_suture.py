@@ -17,11 +17,11 @@ from surgical_marl.evaluation.evaluate import evaluate
 from surgical_marl.physics.outputs import Handled, ObjectView
 from surgical_marl.physics.systems.channel_state import ChannelView
 from surgical_marl.policies.policy import load_policy
-from surgical_marl.tasks.base.grasp_poses import moved
+from surgical_marl.tasks.base.grasp_poses import joints_at, moved
 from surgical_marl.tasks.base.world import World
 from surgical_marl.tasks.needle_drive.path import driven
 from surgical_marl.tasks.needle_drive.task import Best
-from surgical_marl.tasks.suture.script import FIRST, HALFWAY, SECOND, Stitcher
+from surgical_marl.tasks.suture.script import APART, FIRST, HALFWAY, SECOND, Stitcher
 from surgical_marl.tasks.suture.task import Stitch, SutureGoal
 
 TASK, SCENE, ROW = "suture", "bimanual_psm_suture", 5
@@ -182,10 +182,25 @@ def test_the_partner_grips_the_needle_where_it_stands_out_and_the_turn_is_known(
     rows = slice(0, 64)
     entries, sweep = task.entries[rows], task.sweep[rows]
     assert stitcher.can_be_taken(entries, sweep).all()
-    for (_, behind), angle in ((FIRST, task.beyond), (SECOND, HALFWAY)):
-        assert behind < angle / task.needle.bend
+    for grip, angle in ((FIRST, task.beyond), (SECOND, HALFWAY)):
+        assert grip.behind < angle / task.needle.bend
     for angle in (-0.4, 0.3, 2.0, 5.0):
         np.testing.assert_allclose(stitcher.turned(driven(task.needle, entries, angle), entries), angle, atol=1e-9)
+
+
+def test_the_partners_wrist_is_above_the_tissue_as_it_takes_the_needle() -> None:
+    """The wrist is a capsule of 3.5 mm radius behind the jaw; an arm that comes down goes too far by a millimetre."""
+    task: Any = env().task
+    stitcher = Stitcher(task.scene, task.driver, task.partner, task.object, task.needle, task.beyond)
+    there = driven(task.needle, task.entries[:64], task.sweep[:64] + task.beyond)
+    tool, mount = stitcher.taken(there, FIRST), task.scene.mounts[task.partner]
+    upper = task.wound.in_world(task.wound.middle)[2]
+    for back in (APART, 0.0):
+        q, reached = joints_at(mount, moved(tool, -back * tool[:, :3, 2]))
+        assert reached.all()
+        for pose in mount.arm.link_poses(q, ("wrist_pitch_link", "wrist_yaw_link")).values():
+            height = pose[:, :3, 3] @ mount.rotation[2] + mount.position[2] - upper
+            assert (height > 0.0035 + 0.001).all()
 
 
 def test_scenes_without_a_partner_or_a_thread_are_named() -> None:

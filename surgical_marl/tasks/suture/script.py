@@ -1,8 +1,8 @@
 """The partner's part of a stitch, on the host: it takes the needle, draws it out along its arc, pulls, hands it back.
 
-The partner's tool comes from the other end of the slit than the driver's. Near the exit it leans outwards, so that its
-wrist stays above the tissue, and gets no further than a quarter of a turn; where the needle stands out of the tissue it
-takes it again and leans inwards, and turns it all the way out.
+The partner's tool comes from the other end of the slit than the driver's. Near the exit it leans outwards and dips, so
+that its wrist stays above the tissue, and gets no further than a quarter of a turn; where the needle stands out of the
+tissue it takes it again and leans inwards, and turns it all the way out.
 
     stitcher = Stitcher(scene, "psm_0", "psm_1", "needle", needle)
     stitcher.can_be_taken(entries, sweep)          # [n] bool
@@ -24,17 +24,31 @@ if TYPE_CHECKING:
     from surgical_marl.physics.systems.needle import Needle
     from surgical_marl.scenes.scene import Scene
 
-FIRST, SECOND = (np.radians(45.0), 0.0012), (np.radians(-45.0), 0.0020)
-"""Angles by which the partner's tool leans outwards, and lengths of the needle between its tip and the places that are
-gripped, m, near the exit and where the needle stands out."""
+
+class Grip(NamedTuple):
+    """How the partner's tool grips the needle."""
+
+    lean: float
+    """Angle by which it leans outwards, about the wire, rad."""
+    dip: float
+    """Angle by which it points away from the tip, about the axis along which its jaw closes, rad."""
+    behind: float
+    """Length of the needle between its tip and the place that is gripped, m."""
+    beyond: float
+    """Distance by which the tool tip is past the wire, m."""
+
+
+FIRST = Grip(np.radians(45.0), np.radians(20.0), 0.0012, 0.0005)
+"""Near the exit. Square to the wire, which stands upright there, the wrist would lie in the tissue; further past the
+wire the tool tip would press on it."""
+SECOND = Grip(np.radians(-45.0), 0.0, 0.0020, PRESS)
+"""Where the needle stands out."""
 HALFWAY, END = np.radians(70.0), np.radians(186.0)
 """Angles of the needle's turn past the exit as it is taken again, and as it is out."""
 TURN = np.radians(10.0)
 """Angle by which the partner turns the needle at a time."""
 APART, AWAY, CLEAR = 0.008, 0.02, 0.03
 """Distances from which a tool comes, to which it leaves, and by which it keeps above while it turns to come, m."""
-SHALLOW = 0.0005
-"""Distance by which the partner's tool tip is past the wire near the exit, m: further, it would press on the tissue."""
 WIDE = 0.4
 """Opening of a jaw that comes to the needle or leaves it, as a share of its way."""
 UP = np.array([0.0, 0.2, 0.98])
@@ -57,16 +71,11 @@ class Stitcher(NamedTuple):
     beyond: float
     """Angle of the needle's turn past the exit as it is taken, rad."""
 
-    def taken(self, poses: np.ndarray, lean: float, behind: float) -> np.ndarray:
-        """Return poses [n, 4, 4] of the partner's tool that grips needles at poses [n, 4, 4].
-
-        Args:
-            poses: of the needles, in the world.
-            lean: angle by which the tool leans outwards, rad.
-            behind: length from the tip to the place that is gripped, m.
-        """
-        beyond = SHALLOW if lean > 0 else PRESS
-        held = held_at(self.needle, np.array([behind]), np.array([np.pi + lean]), beyond)
+    def taken(self, poses: np.ndarray, grip: Grip) -> np.ndarray:
+        """Return poses [n, 4, 4] of the partner's tool that grips needles at poses [n, 4, 4], in the world."""
+        held = held_at(self.needle, np.array([grip.behind]), np.array([np.pi + grip.lean]), grip.beyond)
+        cosine, sine = np.cos(grip.dip), np.sin(grip.dip)
+        held[:, :3, :3] @= np.array([[cosine, 0.0, -sine], [0.0, 1.0, 0.0], [sine, 0.0, cosine]])
         return self._least_roll(self.partner, poses @ held)
 
     def _least_roll(self, agent: str, tools: np.ndarray) -> np.ndarray:
@@ -84,9 +93,9 @@ class Stitcher(NamedTuple):
             sweep: angles of their turns from the entry to the exit, rad, [n].
         """
         mount, good = self.scene.mounts[self.partner], np.ones(len(entries), bool)
-        for (lean, behind), first, last in ((FIRST, self.beyond, HALFWAY), (SECOND, HALFWAY, END)):
+        for grip, first, last in ((FIRST, self.beyond, HALFWAY), (SECOND, HALFWAY, END)):
             there = driven(self.needle, entries, sweep + first)
-            tool = self.taken(there, lean, behind)
+            tool = self.taken(there, grip)
             q, reached = joints_at(mount, moved(tool, -APART * tool[:, :3, 2]))
             good &= reached
             for share in (0.0, 0.5, 1.0):
@@ -124,8 +133,8 @@ class Stitcher(NamedTuple):
             there = moved(tool, -back * tool[:, :3, 2] + [0.0, 0.0, above])
             return {agent: Wish(there, opens=WIDE, from_home=above > 0)}
 
-        def take(seen: Snapshot, grip: tuple[float, float], *off: float) -> dict[str, Wish]:
-            return comes(partner, self.taken(seen.objects[self.item], *grip), *off)
+        def take(seen: Snapshot, grip: Grip, *off: float) -> dict[str, Wish]:
+            return comes(partner, self.taken(seen.objects[self.item], grip), *off)
 
         def turn(seen: Snapshot, to: float) -> dict[str, Wish]:
             """Turn needles on about the centres of the arcs along which they were driven."""
