@@ -10,10 +10,12 @@ from typing import Any
 from surgical_marl.cli.flags import one_of, some_of, whole
 from surgical_marl.cli.viewing import OWN, add_what, check_shown, pair, settings_of
 from surgical_marl.data.formats import FORMATS
-from surgical_marl.data.request import FORMS, PICTURES, Request
+from surgical_marl.data.request import Request
 from surgical_marl.plugins.tasks import list_tasks
+from surgical_marl.policies.signals import FORMS
 from surgical_marl.runs.progress import preparing
 from surgical_marl.untrusted.files import is_file, user_path
+from surgical_marl.vision.cameras import PICTURES
 
 EPISODES = 50
 """Episodes of a policy unless asked otherwise."""

@@ -17,17 +17,17 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from surgical_marl.data.cameras import Cameras, Picture
-from surgical_marl.data.recording import NODES, Recording
+from surgical_marl.data.recording import Recording
 from surgical_marl.files import remove_temporaries, write_atomic, write_npz, write_text
 from surgical_marl.untrusted.arrays import read_npz
 from surgical_marl.untrusted.files import MAX_JSON, is_file, read_json
 from surgical_marl.untrusted.values import shown
 from surgical_marl.view.video import Mp4
+from surgical_marl.vision.cameras import NODES, Cameras, Picture
 
 if TYPE_CHECKING:
-    from surgical_marl.data.signals import Signals
     from surgical_marl.envs.batch import BatchedEnv
+    from surgical_marl.policies.signals import Signals
 
 ABOUT = "about.json"
 ENCODING = "-preset fast -crf 18 -g 2 -bf 0"
@@ -130,7 +130,7 @@ def add_episode(
     if cameras is not None and films:
         levels = _write_films(folder, number, recording, cameras, films, rate)
     elif cameras is not None:
-        drawn = list(cameras.draw(recording))
+        drawn = list(cameras.draw(recording.seen))
         pictures = {name: np.concatenate([part[name] for part in drawn]) for name in drawn[0]}
     arrays = {"place": np.array(recording.place)}
     for kind, values in (("pictures", pictures), ("levels", levels), ("done", recording.done)):
@@ -167,7 +167,7 @@ def _write_films(
     left = len(recording)
     with contextlib.ExitStack() as opened:
         writers: dict[str, Mp4] = {}
-        for drawn in cameras.draw(recording):
+        for drawn in cameras.draw(recording.seen):
             for name, frames in drawn.items():
                 if not writers.get(name):
                     film = Mp4(parts[name], frames.shape[1:], rate, f"{ENCODING} -f mp4")

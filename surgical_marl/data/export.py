@@ -12,24 +12,24 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from surgical_marl.data.cameras import Cameras, Picture, find_pictures
 from surgical_marl.data.card import card_of
 from surgical_marl.data.dataset import Dataset, add_episode, begin, last_place, numbers
 from surgical_marl.data.formats import FORMATS
 from surgical_marl.data.recording import Recording, played, replayed
 from surgical_marl.data.request import Request
-from surgical_marl.data.signals import Signals, check_form
 from surgical_marl.envs.env import Env
 from surgical_marl.evaluation.environment import find_policy
 from surgical_marl.files import write_text
 from surgical_marl.plugins.task_file import label
 from surgical_marl.policies.policy import load_policy
+from surgical_marl.policies.signals import Signals, check_form, language_of
 from surgical_marl.runs.content import scene_label
 from surgical_marl.runs.fault import PACKAGES
 from surgical_marl.runs.folder import check_writable, owned
 from surgical_marl.runs.progress import progress
 from surgical_marl.runs.settings import Settings, make_env
 from surgical_marl.view.take import open_take
+from surgical_marl.vision.cameras import Cameras, Picture, find_pictures
 
 if TYPE_CHECKING:
     from surgical_marl.envs.batch import BatchedEnv
@@ -181,13 +181,6 @@ def check_rate(rate: int | None, control_rate: int) -> int:
         listed = ", ".join(map(str, good[:-1]))
         raise ValueError(f"--rate must be {listed} or {good[-1]}, so that each row is at a control step, not {rate}")
     return control_rate if rate is None else rate
-
-
-def language_of(env: BatchedEnv) -> str:
-    """Return a task in words, as those learn it that are told what to do: from its description."""
-    name, _, words = env.task.summary().partition(": ")
-    text = words or name
-    return text[:1].upper() + text[1:]
 
 
 def _digest(path: Path) -> str:

@@ -1,7 +1,7 @@
 """Episodes step by step: of a policy that plays, or of a take that is stepped again.
 
 A recording holds numbers and poses, and no pictures: these are drawn from the poses later, for the episodes and at the
-rate that are wanted (`surgical_marl/data/cameras.py`).
+rate that are wanted (`surgical_marl/vision/cameras.py`).
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from surgical_marl.evaluation.goal_set import episode_seed
 from surgical_marl.policies.acting import forget
 from surgical_marl.runs.fault import changed_versions
 from surgical_marl.view.take import start_of
+from surgical_marl.vision.cameras import NODES
 
 if TYPE_CHECKING:
     from surgical_marl.envs.batch import BatchedEnv
@@ -24,10 +25,6 @@ if TYPE_CHECKING:
 
 Act = Callable[[Mapping[str, Any]], Mapping[str, Any]]
 """Maps the observations of all agents to their actions."""
-
-
-NODES = "nodes/"
-"""Prefix of the names of nodes in a recording."""
 
 
 class Recording(NamedTuple):

@@ -3,17 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import product
 from pathlib import Path
 
 from surgical_marl.runs.settings import Settings
 
-FORMS = ("env", "joint", "cartesian", "relative")
-"""Forms of states and actions (`surgical_marl/data/signals.py`)."""
-VIEWS = ("endoscope", "endoscope_right", "outside")
-CHANNELS = {"": "rgb", "_depth": "depth", "_segmentation": "segmentation"}
-"""Ends of the names of pictures, and the channels that they stand for."""
-PICTURES = tuple(view + end for end, view in product(CHANNELS, VIEWS))
 MOST = 4096
 """Pixels of a side of a picture at most."""
 

@@ -14,16 +14,16 @@ import pytest
 
 from surgical_marl.cli.main import main
 from surgical_marl.data import export as exporting
-from surgical_marl.data.cameras import Cameras, find_pictures
 from surgical_marl.data.dataset import read_episode
 from surgical_marl.data.export import export
 from surgical_marl.data.formats import FORMATS
 from surgical_marl.data.recording import Recording, played
 from surgical_marl.data.request import Request
-from surgical_marl.data.signals import Signals
 from surgical_marl.policies.policy import load_policy
+from surgical_marl.policies.signals import Signals
 from surgical_marl.runs.settings import Settings, make_env
 from surgical_marl.view.session import Session
+from surgical_marl.vision.cameras import Cameras, find_pictures
 
 SETTINGS = Settings(task="reach", scene="psm", seed=3, max_steps=12, device="cpu")
 ARM, COUNT, RATE = "psm_0", 3, 25
@@ -42,7 +42,7 @@ def truth() -> tuple[list[Recording], list[dict[str, np.ndarray]], Signals]:
     recordings = [own.every(2) for own in islice(played(env, load_policy("random", env), SETTINGS.seed), COUNT)]
     names = (*PICTURES, "outside_depth", "outside_segmentation")
     cameras = Cameras(env.scene, find_pictures(names, env.scene), SIZE)
-    drawn = [list(cameras.draw(own)) for own in recordings]
+    drawn = [list(cameras.draw(own.seen)) for own in recordings]
     pictures = [{name: np.concatenate([part[name] for part in own]) for name in names} for own in drawn]
     return recordings, pictures, Signals(env, "joint")
 

@@ -12,11 +12,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from surgical_marl.data.recording import Recording, played, replayed
-from surgical_marl.data.request import FORMS
-from surgical_marl.data.signals import Signals, check_form
 from surgical_marl.envs.batch import BatchedEnv
 from surgical_marl.evaluation.goal_set import episode_seed
 from surgical_marl.policies.policy import load_policy
+from surgical_marl.policies.signals import FORMS, Signals, check_form
 from surgical_marl.runs.settings import Settings, make_env
 from surgical_marl.view.session import Session
 from surgical_marl.view.take import OpenTake, open_take, start_of

@@ -10,13 +10,12 @@ import numpy as np
 import pytest
 
 import surgical_marl as sm
-from surgical_marl.data.cameras import Cameras, find_pictures
-from surgical_marl.data.recording import Recording
 from surgical_marl.scenes.poses import Poses
 from surgical_marl.scenes.scene import Scene
 from surgical_marl.view.moment import Moment
 from surgical_marl.view.render import Renderer, View
 from surgical_marl.view.stage import paint, stage
+from surgical_marl.vision.cameras import Cameras, find_pictures
 from surgical_marl.vision.endoscope import CHANNELS, Endoscope
 from surgical_marl.vision.skin import Skin, skins
 from tests.helpers.devices import DEVICES, skip_where_warp_lacks
@@ -179,7 +178,7 @@ def test_pictures_of_a_data_set_show_the_surface() -> None:
     nodes = np.stack([skin.rest, skin.rest + 0.01 * UP]).astype(np.float32)
     seen = {"qpos": np.repeat(scene.home[None], 2, 0), "origin": poses[0], "quaternion": poses[1], "nodes/wound": nodes}
     cameras = Cameras(scene, find_pictures(("endoscope", "outside_segmentation"), scene), (SIZE, SIZE))
-    (drawn,) = cameras.draw(Recording(seen, {}, (0, 0)))
+    (drawn,) = cameras.draw(seen)
     wound = cameras.labels.index("wound")
     assert all((found == wound).mean() > 1e-3 for found in drawn["outside_segmentation"])
     assert (drawn["endoscope"][0] != drawn["endoscope"][1]).mean() > 0.01

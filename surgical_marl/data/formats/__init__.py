@@ -18,7 +18,7 @@ class Format(NamedTuple):
     module: str
     """In this folder: its `write(dataset, out)` fills a new folder with a data set of `surgical_marl.data.dataset`."""
     form: str
-    """Of actions unless another one is chosen, see `surgical_marl/data/signals.py`."""
+    """Of actions unless another one is chosen, see `surgical_marl/policies/signals.py`."""
     needs: str
     """The package that writes it, which `pip install 'surgical-marl[data]'` brings."""
     films: bool = False

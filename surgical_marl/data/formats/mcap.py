@@ -20,7 +20,7 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
 from surgical_marl.data.dataset import Dataset, Episode
-from surgical_marl.data.signals import pose
+from surgical_marl.policies.signals import pose
 
 QUALITY = 95
 """Quality of pictures in JPEG, from 0 to 100."""

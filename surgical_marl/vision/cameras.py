@@ -6,21 +6,25 @@ A picture's name is that of a view, and of a channel but colour: `endoscope`, `e
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import product
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from surgical_marl.content import unknown
-from surgical_marl.data.recording import NODES, Recording
-from surgical_marl.data.request import CHANNELS, PICTURES, VIEWS
 from surgical_marl.runtime import has_cuda
 from surgical_marl.scenes.poses import Poses
 
 if TYPE_CHECKING:
     from surgical_marl.scenes.scene import Scene
 
+VIEWS = ("endoscope", "endoscope_right", "outside")
+CHANNELS = {"": "rgb", "_depth": "depth", "_segmentation": "segmentation"}
+"""Ends of the names of pictures, and the channels that they stand for."""
+PICTURES = tuple(view + end for end, view in product(CHANNELS, VIEWS))
+NODES = "nodes/"
+"""How names of nodes of thread and tissue begin."""
 AT_ONCE = {"cpu": 16, "cuda": 128}
 """Rows that are drawn at once."""
 
@@ -85,10 +89,15 @@ class Cameras:
         }
         self.labels = next((cameras.label_names for cameras in self._cameras.values()), ())
 
-    def draw(self, recording: Recording) -> Iterator[dict[str, np.ndarray]]:
-        """Yield the pictures of some rows at a time, name -> [n, H, W, C], up to the last of the T + 1 rows."""
-        parts = [recording.seen[name] for name in ("qpos", "origin", "quaternion")]
-        soft = {name: part for name, part in recording.seen.items() if name.startswith(NODES)}
+    def draw(self, seen: Mapping[str, np.ndarray]) -> Iterator[dict[str, np.ndarray]]:
+        """Yield the pictures of some rows at a time, name -> [n, H, W, C], up to the last one.
+
+        Args:
+            seen: `qpos` of the whole scene, `origin` and `quaternion` of all that moves but arms, and `nodes/<name>` of
+                thread and tissue, [rows, ...] each.
+        """
+        parts = [seen[name] for name in ("qpos", "origin", "quaternion")]
+        soft = {name: part for name, part in seen.items() if name.startswith(NODES)}
         rows = len(parts[0])
         for first in range(0, rows, self._at_once):
             chosen = np.minimum(np.arange(first, first + self._at_once), rows - 1)
