@@ -34,6 +34,7 @@ from typing import TYPE_CHECKING, Any
 
 from surgical_marl.content import list_arms, list_objects, list_policies, list_scenes
 from surgical_marl.interfaces.registration import register_ids, register_task
+from surgical_marl.plugins.adapters import list_adapters, register_adapter
 from surgical_marl.plugins.algorithms import list_algorithms, register_algorithm
 from surgical_marl.plugins.controls import list_controls, register_control
 from surgical_marl.plugins.systems import list_systems, register_system
@@ -72,6 +73,7 @@ __all__ = [
     "TipTask",
     "Video",
     "jax_env",
+    "list_adapters",
     "list_algorithms",
     "list_arms",
     "list_controls",
@@ -84,6 +86,7 @@ __all__ = [
     "load_object",
     "load_scene",
     "parallel_env",
+    "register_adapter",
     "register_algorithm",
     "register_control",
     "register_system",

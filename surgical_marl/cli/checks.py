@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from surgical_marl.content import BASELINES, PARTNERS, find, list_policies, unknown
+from surgical_marl.plugins.adapters import is_adapted, list_adapters, read_adapted
 from surgical_marl.plugins.tasks import TASKS, find_task, list_tasks
 from surgical_marl.untrusted.files import is_folder, user_path
 
@@ -38,10 +39,16 @@ def check_level(arguments: argparse.Namespace) -> None:
 
 
 def check_policies(policies: Sequence[str]) -> None:
-    """Raise ValueError if one of some names is no run folder, no policy that ships and none of `BASELINES`."""
+    """Raise ValueError if one of some names is no run folder, no policy that ships or has an adapter, no baseline."""
     for policy in policies:
-        if policy not in BASELINES and not is_folder(user_path(policy)) and policy not in list_policies():
-            raise unknown("run or policy", policy, [*list_policies(), *BASELINES])
+        _check_policy("run or policy", policy, BASELINES)
+
+
+def _check_policy(noun: str, policy: str, others: Sequence[str]) -> None:
+    if is_adapted(policy):
+        read_adapted(policy)
+    elif policy not in others and not is_folder(user_path(policy)) and policy not in list_policies():
+        raise unknown(noun, policy, [*list_policies(), *others, *(f"{name}:PLACE" for name in list_adapters())])
 
 
 def read_partners(given: Sequence[str]) -> dict[str, str]:
@@ -53,8 +60,7 @@ def read_partners(given: Sequence[str]) -> dict[str, str]:
             raise ValueError(f"--partner must be ROLE=POLICY such as psm_0=frozen, not {text!r}")
         if role in found:
             raise ValueError(f"--partner names {role!r} twice")
-        if policy not in PARTNERS and not is_folder(user_path(policy)) and policy not in list_policies():
-            raise unknown("partner", policy, [*list_policies(), *PARTNERS])
+        _check_policy("partner", policy, PARTNERS)
         found[role] = policy
     return found
 

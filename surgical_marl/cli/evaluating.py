@@ -8,8 +8,9 @@ from collections.abc import Sequence
 from typing import Any
 
 from surgical_marl.cli.checks import check_file, check_level, check_names, check_policies, read_partners
-from surgical_marl.cli.flags import add_flags, task_help, whole
+from surgical_marl.cli.flags import adapted_help, add_flags, task_help, whole
 from surgical_marl.content import BASELINES, PARTNERS, list_policies, list_scenes, unknown
+from surgical_marl.plugins.adapters import is_adapted
 from surgical_marl.plugins.tasks import list_tasks
 from surgical_marl.runs.progress import preparing
 from surgical_marl.tasks.base.options import SAME, Options
@@ -19,7 +20,7 @@ from surgical_marl.untrusted.files import is_file, is_folder, user_path
 def add_eval(commands: Any) -> None:
     """Add the command eval."""
     parser = commands.add_parser("eval", help="measure policies on a fixed set of goals (docs/evaluation.md)")
-    what = f"a run folder, a policy's name, {', '.join(BASELINES)}; or runs that differ by their seed, for its spread"
+    what = f"a run folder, a policy's name, {', '.join(BASELINES)}, {adapted_help()}; or runs that differ by their seed"
     parser.add_argument("policies", nargs="+", metavar="RUN_OR_POLICY", help=what)
     _add_options(parser)
     who = f"who moves an agent instead: a run folder, a policy's name, {', '.join(PARTNERS)}; can be given again"
@@ -36,7 +37,7 @@ def add_eval(commands: Any) -> None:
 def add_crossplay(commands: Any) -> None:
     """Add the command crossplay."""
     parser = commands.add_parser("crossplay", help="let teams play each other's roles (docs/crossplay.md)")
-    what = f"run folders and policies of one task and scene, {', '.join(BASELINES)}"
+    what = f"run folders and policies of one task and scene, {', '.join(BASELINES)}, {adapted_help()}"
     parser.add_argument("teams", nargs="+", metavar="RUN_OR_POLICY", help=what)
     _add_options(parser)
     parser.add_argument("--json", action="store_true", help="one JSON object instead of tables")
@@ -125,7 +126,7 @@ def _check_played(arguments: argparse.Namespace, policies: Sequence[str]) -> Non
     """Raise ValueError unless the task, the scene and the policies exist, and name all that has to be named."""
     check_names(arguments)
     check_policies(policies)
-    if policies and set(policies) <= set(BASELINES):
+    if policies and all(policy in BASELINES or is_adapted(policy) for policy in policies):
         check_level(arguments)
         if None in (arguments.task, arguments.scene):
             good = f"--task ({', '.join(list_tasks())}) and --scene ({', '.join(list_scenes())})"

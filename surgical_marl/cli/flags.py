@@ -9,6 +9,7 @@ from dataclasses import fields
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
 from surgical_marl.content import unknown
+from surgical_marl.plugins.adapters import list_adapters
 from surgical_marl.plugins.tasks import list_tasks
 
 
@@ -50,6 +51,11 @@ def given(arguments: argparse.Namespace, of: type) -> dict[str, Any]:
 def task_help() -> str:
     """Return the text for `--help` of a flag or an argument that names a task."""
     return f"one of: {', '.join(list_tasks())}; or a task file, my_task.py or my_task.py:Class"
+
+
+def adapted_help() -> str:
+    """Return the text for `--help` of a flag or an argument that names a policy, on those of other libraries."""
+    return f"{' or '.join(f'{name}:PLACE' for name in list_adapters())} (docs/your_own_policy.md)"
 
 
 def _reader(kind: Any, limits: tuple[int, int] | None) -> tuple[Callable[[str], Any], str]:

@@ -12,8 +12,9 @@ from pathlib import Path
 from typing import Any
 
 from surgical_marl.cli.checks import check_file, check_level, check_names, check_policies
-from surgical_marl.cli.flags import add_flags, task_help, whole
+from surgical_marl.cli.flags import adapted_help, add_flags, task_help, whole
 from surgical_marl.content import BASELINES, find, list_scenes
+from surgical_marl.plugins.adapters import is_adapted
 from surgical_marl.plugins.tasks import TASKS
 from surgical_marl.runs.process import ending_signals
 from surgical_marl.runs.progress import preparing, say
@@ -71,7 +72,7 @@ def add_what(parser: argparse.ArgumentParser, policy: str = "the policy that shi
     parser.add_argument(
         "--scene", help="a name (see `list scenes`) or a .yaml file (default: the policy's, or else the task's own)"
     )
-    what = f"a run folder, a policy's name, {', '.join(BASELINES)} (default: {policy})"
+    what = f"a run folder, a policy's name, {', '.join(BASELINES)}, {adapted_help()} (default: {policy})"
     parser.add_argument("--policy", metavar="RUN_OR_POLICY", help=what)
     add_flags(parser, Options, OWN, default="the policy's own")
     parser.add_argument("--seed", type=whole(0, 2**31 - 1), default=0, metavar="S")
@@ -204,7 +205,7 @@ def check_shown(arguments: argparse.Namespace) -> None:
     if arguments.task is None:
         check_level(arguments)
         return
-    if arguments.policy not in (None, *BASELINES):
+    if arguments.policy not in (None, *BASELINES) and not is_adapted(arguments.policy):
         arguments.scene = _scene_of(arguments, arguments.policy)
     arguments.scene = arguments.scene or TASKS.load(arguments.task).default_scene
     if arguments.scene is None:

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from surgical_marl.content import BASELINES, find
+from surgical_marl.plugins.adapters import is_adapted
 from surgical_marl.policies.target_mover import check_control
 from surgical_marl.runs.content import scene_label
 from surgical_marl.runs.folder import check_trained, read_settings
@@ -27,7 +28,7 @@ def common_settings(policies: Sequence[str], asked: Mapping[str, str | None]) ->
     if len(set(policies)) < len(policies):
         raise ValueError(f"{max(policies, key=policies.count)!r} is named twice")
     given = {"goals": "held_out", **{key: value for key, value in asked.items() if value is not None}}
-    trained = [policy for policy in policies if policy not in BASELINES]
+    trained = [policy for policy in policies if not has_no_task(policy)]
     settings = {policy: _settings(policy, given) for policy in trained or policies}
     name, first = next(iter(settings.items()))
     for policy, other in settings.items():
@@ -42,13 +43,18 @@ def common_settings(policies: Sequence[str], asked: Mapping[str, str | None]) ->
     return first
 
 
+def has_no_task(policy: str) -> bool:
+    """Return whether a policy has no task and scene of its own: one of `BASELINES`, or of another library."""
+    return policy in BASELINES or is_adapted(policy)
+
+
 def find_policy(name: str) -> str | Path:
-    """Return the folder of a run or policy; a name of `BASELINES` stays as it is."""
-    return name if name in BASELINES else find("policies", name)
+    """Return the folder of a run or policy; the name of one that `has_no_task` stays as it is."""
+    return name if has_no_task(name) else find("policies", name)
 
 
 def _settings(policy: str, asked: Mapping[str, str]) -> Settings:
-    if policy in BASELINES:
+    if has_no_task(policy):
         return Settings(**asked)  # type: ignore[arg-type]
     settings = read_settings(find("policies", policy))
     for key in SAME:

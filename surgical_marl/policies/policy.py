@@ -1,4 +1,4 @@
-"""Policies that act: of a run, zero and random.
+"""Policies that act: of a run, of another library, zero and random.
 
 A policy maps the observations of all agents `{agent: [..., d]}` to their actions `{agent: [..., a]}` in [-1, 1]. It
 returns NumPy arrays for NumPy arrays and tensors for tensors. A recurrent policy must be told where episodes begin
@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from surgical_marl.envs.observations import proprioception
+from surgical_marl.plugins.adapters import is_adapted
 from surgical_marl.policies.acting import Policy, forget, like
 from surgical_marl.policies.layout import fitting_layout
 from surgical_marl.policies.oracle import oracle
@@ -29,12 +30,13 @@ def load_policy(run: str | Path, env: BatchedEnv) -> Policy:
     """Load the deterministic policy of a run for the agents of an environment.
 
     Args:
-        run: a run folder, or the name of a policy that ships, or "zero", "random" or "oracle".
+        run: a run folder, or the name of a policy that ships, or "zero", "random" or "oracle"; or a policy of another
+            library by its adapter, such as "lerobot:outputs/act".
         env: the environment that the policy will act in.
 
     Raises:
         ValueError: there is no such run, its checkpoint is damaged, or it was trained on other
-            agents.
+            agents; or what `adapted` refuses.
     """
     if run == "zero":
         return zero_policy(env)
@@ -42,6 +44,10 @@ def load_policy(run: str | Path, env: BatchedEnv) -> Policy:
         return random_policy(env)
     if run == "oracle":
         return oracle(env)
+    if is_adapted(run):
+        from surgical_marl.policies.adapted import adapted
+
+        return adapted(str(run), env)
     trained = read_settings(find_run(run)).observations
     policy = _load(run, env)
     return policy if trained == env.env.options.observations else _Restating(policy, env, trained)

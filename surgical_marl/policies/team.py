@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from surgical_marl.content import BASELINES, PARTNERS, unknown
+from surgical_marl.plugins.adapters import is_adapted
 from surgical_marl.policies.acting import forget, like, to_numpy
 from surgical_marl.policies.frozen import Frozen
 from surgical_marl.policies.oracle import oracle
@@ -37,7 +38,7 @@ class Team:
 
     Args:
         env: the environments that it acts in.
-        name: a run folder, or the name of a policy that ships, or "zero", "random" or "oracle".
+        name: as for `load_policy`.
         partners: agent -> who moves it instead: such a name, or "frozen", or "delayed": what the team itself would do,
             but not before `DELAY`.
 
@@ -95,7 +96,7 @@ def _check_roles(partners: Mapping[str, str], agents: Sequence[str]) -> None:
 
 def check_same(who: str, own: Mapping[str, Any]) -> None:
     """Raise ValueError if a policy was trained with other settings than these, of `SAME`."""
-    if who in (*PARTNERS, *BASELINES):
+    if who in (*PARTNERS, *BASELINES) or is_adapted(who):
         return
     settings = read_settings(find_run(who))
     for key, value in own.items():

@@ -1,4 +1,4 @@
-"""Movers of arms: a policy that ships, a run, the oracle, nobody, or a person.
+"""Movers of arms: a policy that ships, a run, a policy of another library, the oracle, nobody, or a person.
 
 movers = Movers(env, "reach-bimanual_psm")
 movers.set("psm_1", "you", observations)
@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from surgical_marl.content import find, list_policies, unknown
+from surgical_marl.plugins.adapters import is_adapted
 from surgical_marl.policies.target_mover import moves_targets
 from surgical_marl.policies.team import check_fits
 from surgical_marl.policies.teammates import FROZEN, Teammates
@@ -132,7 +133,7 @@ def _fits(name: str, env: BatchedEnv) -> bool:
 
 def _place(name: str, env: BatchedEnv) -> str | Path:
     """Return a policy as `Teammates` takes it; ValueError if there is none, or it does not fit the environment."""
-    if name in SIMPLE:
+    if name in SIMPLE or is_adapted(name):
         return name
     check_name(name, "a run")
     folder = find("policies", name)

@@ -1,0 +1,1 @@
+"""Adapters that ship: a module for each, found by its name."""
