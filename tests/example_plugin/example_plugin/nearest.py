@@ -16,7 +16,7 @@ SEEN = "observation.environment_state"
 
 
 class Nearest(PolicyAdapter):
-    """`nearest:DIR`, a data set that `surgical-marl export episodes --format lerobot` wrote.
+    """`nearest:DIR`, a data set of format lerobot that `surgical-marl export episodes` wrote.
 
     Args:
         place: its folder.
