@@ -27,29 +27,49 @@ class Watch(NamedTuple):
 def check_finite(code: ir.Code, watch: Watch) -> ir.Code:
     """Add up 0 times each number that must be finite: 0, or NaN if one of them was NaN or infinite.
 
-    before: STF(state,3,v9);
-    after:  F watch_=SPLAT(0.0f); STF(state,3,v9); watch_+=v9*SPLAT(0.0f);
+    A field that would be stored as it is, is only looked at.
+
+    before: STF(state,3,v9); STF(state,4,LDF(state,4));
+    after:  F watch_=SPLAT(0.0f); STF(state,3,v9); watch_+=v9*SPLAT(0.0f); watch_+=LDF(state,4)*SPLAT(0.0f);
             B bad_=watch_!=SPLAT(0.0f);if(ANY(bad_)){STB(flags,0,LDB(flags,0)|bad_)}
     """
     found: ir.Code = [ir.Define("watch_", "f", np.float32(0))]
     for one in code:
-        found.append(one)
-        if isinstance(one, ir.Store) and (one.buffer, one.field) in watch.fields:
-            found.append(ir.CheckFinite(one.value))
-        elif isinstance(one, ir.Repeat) and isinstance(one.one, ir.Store):
-            found += _checked_row(one.one, one.rounds, watch)
+        store, rounds = (one.one, one.rounds) if isinstance(one, ir.Repeat) else (one, 1)
+        if not isinstance(store, ir.Store):
+            found.append(one)
+            continue
+        if not _stays(store):
+            found.append(one)
+        found += _checks(store, rounds, watch)
     return [*found, ir.ReportFinite(watch.flag)]
 
 
-def _checked_row(store: ir.Store, rounds: int, watch: Watch) -> ir.Code:
-    """Return the checks of what a loop stores: of an array's elements, in one loop if all are watched."""
-    watched = [(store.buffer, store.field + store.stride * k) in watch.fields for k in range(rounds)]
-    if all(watched):
-        return [ir.Repeat(rounds, ir.CheckFinite(store.value))]
+def _stays(store: ir.Store) -> bool:
+    """Return whether a store leaves its fields as they are."""
+    places = {(store.buffer, store.field), (store.buffer, store.field, store.stride)}
+    return isinstance(store.value, ir.Call) and store.value.op in ("load", "fields") and store.value.args in places
+
+
+def _checks(store: ir.Store, rounds: int, watch: Watch) -> ir.Code:
+    """Return the checks of what is stored, in one loop if all of it is watched."""
     value = store.value
-    assert isinstance(value, ir.Element)
-    offsets = (value.offset + value.stride * k for k in range(rounds) if watched[k])
-    return [ir.CheckFinite(value._replace(offset=offset, stride=0)) for offset in offsets]
+    if isinstance(value, np.generic) and np.isfinite(value):
+        return []
+    watched = [k for k in range(rounds) if (store.buffer, store.field + store.stride * k) in watch.fields]
+    if rounds > 1 and len(watched) == rounds:
+        return [ir.Repeat(rounds, ir.CheckFinite(value))]
+    return [ir.CheckFinite(_of_round(value, k)) for k in watched]
+
+
+def _of_round(value: ir.Operand, k: int) -> ir.Operand:
+    """Return the value in round `k` of a loop."""
+    if isinstance(value, ir.Element):
+        return value._replace(offset=value.offset + value.stride * k, stride=0)
+    if isinstance(value, ir.Call) and value.op == "fields":
+        buffer, first, step = value.args
+        return ir.Call("load", value.kind, (buffer, first + step * k))  # type: ignore[operator, arg-type]
+    return value
 
 
 def count_work(code: ir.Code) -> ir.Code:

@@ -3,13 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from itertools import groupby
-from typing import Any
 
-import numpy as np
-
-from surgical_marl.engines.fused import instructions as ir
-from surgical_marl.engines.fused.graph import LEAST_ROW, Graph, Value
+from surgical_marl.engines.fused.graph import Graph, Value
 from surgical_marl.engines.fused.schedule import Schedule, Scheduler
 
 
@@ -58,47 +53,6 @@ def store_late(graph: Graph, schedule: Schedule, stores: list[tuple[str, int, Va
     items = schedule.regions[0].items
     after = {field: at + 0.5 for at, item in enumerate(items) for field in _loads(graph, schedule, *item)}
     _move(items, {at: max(at, after.get(stores[k][:2], 0)) for at, (kind, k) in enumerate(items) if kind == "result"})
-
-
-def roll_stores(code: ir.Code) -> ir.Code:
-    """Store elements of arrays by loops, where they go to fields in a row: a C compiler takes long for so many lines.
-
-    Arrays whose elements are all at known indices stay as they are: a compiler keeps those in registers.
-
-    before: STF(state,3,v9[0]); STF(state,4,v9[1]); ... STF(state,34,v9[31]);
-    after:  for(int k=0;k<32;++k)STF(state,3+(1)*k,v9[0+(1)*k]);
-    """
-    known, found = ir.arrays_in_memory(code), ir.Code()
-
-    def array(one: ir.Instruction) -> str:
-        """Return the array in memory that a store has its value from, or nothing."""
-        value = one.value if isinstance(one, ir.Store) else None
-        in_row = isinstance(value, ir.Element) and value.base is None and value.array in known
-        return value.array if in_row else ""  # type: ignore[union-attr]
-
-    for rolls, block in groupby(code, lambda one: bool(array(one))):
-        if not rolls:
-            found += block
-            continue
-        rows: dict[Any, list[Any]] = {}
-        for one in block:
-            rows.setdefault((one.buffer, array(one)), []).append(one)  # type: ignore[union-attr]
-        for row in rows.values():
-            found += _rolled(row)
-    return found
-
-
-def _rolled(row: list[ir.Store]) -> ir.Code:
-    """Return stores of one array's elements, by a loop if fields and elements are both in a row."""
-    if len(row) < LEAST_ROW:
-        return [*row]
-    row = sorted(row, key=lambda one: one.field)
-    values = [one.value for one in row if isinstance(one.value, ir.Element)]
-    fields, places = np.diff([one.field for one in row]), np.diff([value.offset for value in values])
-    if np.ptp(fields) or np.ptp(places):
-        return [*row]
-    value = values[0]._replace(stride=int(places[0]))
-    return [ir.Repeat(len(row), row[0]._replace(value=value, stride=int(fields[0])))]
 
 
 def _move(items: list[tuple[str, int]], places: dict[int, float]) -> None:

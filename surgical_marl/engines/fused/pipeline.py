@@ -15,9 +15,10 @@ from surgical_marl.engines.fused.instructions import Code, ReportWork, large_bra
 from surgical_marl.engines.fused.instrumentation import Watch, check_finite, count_work
 from surgical_marl.engines.fused.lower import Stores, lower
 from surgical_marl.engines.fused.macros import is_long
-from surgical_marl.engines.fused.memory_order import load_early, roll_stores, store_early, store_late
+from surgical_marl.engines.fused.memory_order import load_early, store_early, store_late
 from surgical_marl.engines.fused.options import read_options
 from surgical_marl.engines.fused.stack_allocation import share_memory
+from surgical_marl.engines.fused.stores import roll_stores, store_in_branches
 from surgical_marl.engines.fused.vector_layout import interleave
 from surgical_marl.engines.fused.verify import check_code, check_graph, check_schedule
 from surgical_marl.files import write_text
@@ -101,6 +102,7 @@ PASSES = (
     Pass("load_early", lambda program: load_early(program.graph, program.schedule), "schedule"),
     Pass("store_late", _store_late, "schedule", required=True),
     Pass("lower", _lower, "code", required=True),
+    Pass("store_in_branches", _code(store_in_branches), "code", "cuda"),
     Pass("roll_stores", _code(roll_stores), "code"),
     Pass("check_finite", _check_finite, "code", required=True),
     Pass("count_work", _code(count_work), "code"),

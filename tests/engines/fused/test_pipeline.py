@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from jax import lax
 
-from surgical_marl.engines.fused import graph, hints, instructions, instrumentation, memory_order, source_cache
+from surgical_marl.engines.fused import graph, hints, instructions, instrumentation, source_cache, stores
 from surgical_marl.engines.fused import instructions as ir
 from surgical_marl.engines.fused.graph import Graph
 from surgical_marl.engines.fused.options import DUMP, PASSES, VERIFY
@@ -38,7 +38,8 @@ def function(x: Any, which: Any) -> Any:
 
     rows, (first, second) = lax.scan(change, x * jnp.arange(6.0), jnp.arange(6))
     summed = lax.fori_loop(0, 6, lambda k, s: s + first[k] * second[k], x)
-    return lax.while_loop(lambda s: s < 9, lambda s: 2 * abs(s) + 1, summed), rows, x, which + 1
+    side = lax.cond(which % 2 > 0, lambda: 3 * x, lambda: x)
+    return lax.while_loop(lambda s: s < 9, lambda s: 2 * abs(s) + 1, summed), rows, x, which + 1, side
 
 
 @pytest.fixture(autouse=True)
@@ -47,7 +48,7 @@ def verified(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(VERIFY, "1")
     monkeypatch.setattr("surgical_marl.engines.fused.macros.LONG_CODE", 0)
     monkeypatch.setattr(hints, "LARGE", 0)
-    for module in (graph, instructions, memory_order):
+    for module in (graph, instructions, stores):
         monkeypatch.setattr(module, "LEAST_ROW", 4)
     for size in ("LARGE", "LARGE_PATH"):
         monkeypatch.setattr(instrumentation, size, 0)
@@ -108,6 +109,54 @@ def test_fields_in_a_row_are_moved_by_loops() -> None:
         assert "LDF(state,0+(1)*k)" in code and "=LDF(state,6);" in code
         assert len([line for line in code.splitlines() if "STF(" in line and "+(1)*k,v" in line]) == 1
     check_results(changed, columns, 1e-6)
+
+
+def test_a_reset_is_stored_in_its_branch() -> None:
+    """A side stores constants, or what other fields hold, by loops; one value is also read behind the branch."""
+
+    def reset(rows: Any, done: Any) -> Any:
+        first = lax.cond(done % 2 > 0, lambda: (jnp.full(12, 2.0), jnp.float32(1)), lambda: (rows[:12], rows[12]))
+        return *first, first[1] * 2
+
+    columns = RNG.uniform(-1, 1, (9, 13)).astype(np.float32), COLUMNS[1]
+    side, other, behind = (
+        text(False, reset, columns).split("\n}else{\n")[0],
+        *text(False, reset, columns).split("}")[1:3],
+    )
+    loop = "for(int k=0;k<12;++k)STF(outs,0+(1)*k,"
+    assert f"{loop}SPLAT(2.0f));" in side and f"{loop}LDF(state,0+(1)*k));" in other and "STF(outs,12," in behind
+    check_results(reset, columns, 1e-6)
+
+
+FIELDS = [ir.Define(f"v{k}", "f", ir.Call("load", "f", ("state", k))) for k in range(8)]
+
+
+def test_fields_that_change_places_are_loaded_before_they_are_stored() -> None:
+    """Rows of fields are copied by a loop, but not if a store before the loop, or in it, changes what it reads."""
+    kept = [ir.Store("state", 4 + k, "f", f"v{k}") for k in range(4)]
+    changed = [ir.Store("state", (k + 4) % 8, "f", f"v{k}") for k in range(8)]
+    assert stores.roll_stores([*FIELDS, *changed]) == [*FIELDS, *sorted(changed, key=lambda one: one.field)]
+    assert len(stores.roll_stores([*FIELDS, *kept])) < len([*FIELDS, *kept])
+    own = [ir.Store("state", k, "f", f"v{k}") for k in range(8)]
+    (loop,) = stores.roll_stores([*FIELDS, *own])
+    watch = instrumentation.Watch(frozenset(("state", k) for k in range(8)), 0)
+    (check,) = [one for one in instrumentation.check_finite([loop], watch) if isinstance(one, ir.Repeat)]
+    assert isinstance(check.one, ir.CheckFinite)
+
+
+@pytest.mark.parametrize("late", [None, "chosen", "behind"])
+def test_a_store_stays_behind_loads_of_its_field(late: str | None) -> None:
+    """It is not moved into a branch if the field is still loaded there, or between the branch and the store."""
+    load = ir.Define("late", "f", ir.Call("load", "f", ("state", 3)))
+    sizes = ir.Size(1, 1), ir.Size(1, 1)
+    code = [
+        ir.Define("c", "b", np.bool_(True)), ir.Define("v9", "f"), ir.If("c", 0, sizes, ()),
+        ir.Assign("v9", np.float32(1)), *[load] * (late == "chosen"), ir.Else("c"), *FIELDS[3:4],
+        ir.Assign("v9", "v3"), ir.End(), *[load] * (late == "behind"), ir.Store("state", 3, "f", "v9"),
+    ]  # fmt: skip
+    found = stores.store_in_branches(code)
+    assert (found == code) == (late is not None)
+    assert sum(isinstance(one, ir.Store) for one in found) == (1 if late else 2)
 
 
 @pytest.mark.parametrize("word", ["interleave", "-place", "-interleaving", "-"])
