@@ -20,7 +20,7 @@ from surgical_marl.engines.fused.operations import KIND_OF
 from surgical_marl.engines.fused.symbolic_array import AnyArray, SymbolicArray, Table, values_of
 
 LEAST_TABLE = 16
-"""Least number of constants, or of real values, that are looked up in memory instead of being selected one by one."""
+"""Least number of constants, or of numbers, that are looked up in memory instead of being selected one by one."""
 
 Places = list[np.ndarray]
 """For each axis of an array, where on it each element of a result comes from."""
@@ -197,10 +197,11 @@ def _read_or_choose(
     block = ids[tuple(slice(None) if axis in moving else place for axis, place in enumerate(fixed))]
     found = view(g, block)
     if found is None or found.op != "read":
-        if block.size < LEAST_TABLE or g.kind(int(block.flat[0])) != "f":
+        kind = g.kind(int(block.flat[0]))
+        if block.size < LEAST_TABLE or kind == "b":
             return _choose_one(g, ids, lasts, fixed, moving)
         strides = tuple(int(n) for n in np.cumprod([1, *block.shape[:0:-1]])[::-1])
-        found = View("read", g.array(block.ravel().tolist()), None, 0, strides, "f")
+        found = View("read", g.array(block.ravel().tolist()), None, 0, strides, kind)
     return found.at(g, [g.add(_like(g, moving[axis], fixed[axis]), moving[axis]) for axis in sorted(moving)])
 
 

@@ -47,17 +47,20 @@ class Course(NamedTuple):
 
 
 class Joined(NamedTuple):
-    """The pairs in the matrix of a step: p of them, [3 p, ...]."""
+    """The pairs in the matrix of a step: p of them, on n nodes."""
 
     moves: Array
-    """Displacements and tensions by a pull at a pair, scaled by the root of its stiffness, [3 p, n, 4]."""
+    """Displacements and tensions by a pull at a pair, scaled by the root of its stiffness, [3 p n, 4].
+
+    The n rows of one pull after those of another: a kernel has arrays of one axis.
+    """
     factor: Array
     """Cholesky factor of the pairs' own matrix, [3 p, 3 p]."""
 
 
 def apart_from_itself(rows: int, nodes: int) -> Joined:
     """Return the matrix of no pairs."""
-    return Joined(jnp.zeros((3 * rows, nodes, 4)), jnp.zeros((3 * rows, 3 * rows)))
+    return Joined(jnp.zeros((3 * rows * nodes, 4)), jnp.zeros((3 * rows, 3 * rows)))
 
 
 def find(shapes: Shapes, velocity: Array, rows: int, stiffness: float, sliding: float, dt: Any) -> Ends:
@@ -159,9 +162,9 @@ def _bent(length: Array, reach: Array) -> Array:
     return jnp.sqrt(8 * jnp.maximum(1 - reach / jnp.maximum((APART - 1) * length, 1e-12), 0.0))
 
 
-def apart(end: End, u: Array) -> Array:
-    """Return how far the points of one pair move apart, [3], by the displacements of nodes, [n, 3]."""
-    return _at(u, end.part, end.share) - _at(u, end.shape, end.place[0])
+def apart(end: End, u: Array, first: Any = 0) -> Array:
+    """Return how far the points of one pair move apart, [3], by displacements of nodes, from row `first` of u on."""
+    return _at(u, first + end.part, end.share) - _at(u, first + end.shape, end.place[0])
 
 
 def add_forces(pairs: Ends, u: Array, others: Array) -> Array:
@@ -190,17 +193,18 @@ def joined(pairs: Ends, u: Array, solve: Callable[[Array], Array], last: Joined)
         solve: takes forces on nodes [n, 3], returns displacements and tensions [n, 4] of the chain without pairs.
         last: of the Newton step before, or `apart_from_itself`.
     """
-    p, roots = len(pairs.rows.part), _roots(pairs, u)
+    (n, _), p, roots = u.shape, len(pairs.rows.part), _roots(pairs, u)
 
-    def column(number: Array) -> Array:
+    def pull(number: Array, moves: Array) -> Array:
         end = row_of(pairs.rows, number // 3)
-        pull = roots[number // 3] @ jnp.where(jnp.arange(3) == number % 3, 1.0, 0.0)
-        return solve(pulled(end, jnp.zeros_like(u), pull))
+        force = roots[number // 3] @ jnp.where(jnp.arange(3) == number % 3, 1.0, 0.0)
+        return jax.lax.dynamic_update_slice(moves, solve(pulled(end, jnp.zeros_like(u), force)), (n * number, 0))
 
-    moves = jax.lax.fori_loop(0, 3 * pairs.total, lambda k, found: put(found, k, column(k)), last.moves)
+    moves = jax.lax.fori_loop(0, 3 * pairs.total, pull, last.moves)
 
     def factored() -> Array:
-        across = jax.lax.map(lambda own: _projected(pairs, roots, own), moves)
+        numbers = jnp.arange(3 * p, dtype=jnp.int32)
+        across = jax.lax.map(lambda number: _projected(pairs, roots, moves, n * number), numbers)
         return cholesky(np.eye(3 * p, dtype=np.float32) + (across + across.T) / 2)
 
     return Joined(moves, jax.lax.cond(pairs.total > 0, factored, lambda: last.factor))
@@ -214,9 +218,11 @@ def add(pairs: Ends, u: Array, own: Joined, change: Array) -> Array:
 
     pull = jax.lax.cond(pairs.total > 0, weights, lambda: jnp.zeros(3 * len(pairs.rows.part)))
 
+    n = len(change)
+
     def less(k: Array, change: Array) -> Array:
-        share = pull[k]
-        return jax.lax.map(lambda row: row[0] - share * row[1], (change, own.moves[k]))
+        share, nodes = pull[k], jnp.arange(n, dtype=jnp.int32)
+        return jax.lax.map(lambda row: row[1] - share * own.moves[n * k + row[0]], (nodes, change))
 
     found: Array = jax.lax.fori_loop(0, 3 * pairs.total, less, change)
     return found
@@ -236,9 +242,9 @@ def _roots(pairs: Ends, u: Array) -> Array:
     return found
 
 
-def _projected(pairs: Ends, roots: Array, change: Array) -> Array:
-    """Return the displacements [n, 4] as pairs see them, times the roots of their stiffnesses, [3 p]."""
-    found: Array = each(pairs, lambda row, end: roots[row] @ apart(end, change[:, :3]))
+def _projected(pairs: Ends, roots: Array, change: Array, first: Any = 0) -> Array:
+    """Return the displacements in rows of 4, from `first` on, as pairs see them, times their roots, [3 p]."""
+    found: Array = each(pairs, lambda row, end: roots[row] @ apart(end, change[:, :3], first))
     return found.ravel()
 
 
