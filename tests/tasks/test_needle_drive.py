@@ -17,10 +17,11 @@ from surgical_marl.evaluation.evaluate import evaluate
 from surgical_marl.physics.outputs import Handled, ObjectView
 from surgical_marl.physics.systems.channel_state import ChannelView
 from surgical_marl.policies.policy import load_policy
+from surgical_marl.scenes.load import load_scene
 from surgical_marl.tasks.base.grasp_poses import frames, joints_at
 from surgical_marl.tasks.base.world import World
 from surgical_marl.tasks.needle_drive.path import axis_of, driven, entry_poses, held_at, reaching
-from surgical_marl.tasks.needle_drive.starts import BEFORE, BEYOND
+from surgical_marl.tasks.needle_drive.starts import BEFORE, BEYOND, LOOSE
 from surgical_marl.tasks.needle_drive.task import SHARP, Best, DriveGoal
 
 TASK, SCENE, ROW = "needle_drive", "psm_suture", 5
@@ -89,6 +90,16 @@ def test_marks_are_on_both_edges_and_the_arm_can_make_the_whole_way(difficulty: 
         first, second = np.array(task.scene.systems["thread"].path[:2])
         tails = starts @ np.append(task._three[2], 1.0)
         assert ((starts[:, :3, 3] - tails[:, :3]) @ (second - first) < 1e-9).all()
+
+
+@pytest.mark.parametrize("name", ["psm_suture", "bimanual_psm_suture"])
+def test_a_needle_that_lies_on_its_pad_is_off_the_wound(name: str) -> None:
+    """Else it begins across the gap between pad and wound, with its tip in the tissue."""
+    scene = load_scene(name)
+    needle, wound = scene.objects["needle"], scene.systems["wound"]
+    radius = max(np.linalg.norm(place) for place, _ in needle.object.sites.values())
+    off = np.abs(needle.position[1]) - np.abs(wound.rest[:, 1]).max()  # the wound's middle is at y = 0
+    assert off > radius + LOOSE + 0.002
 
 
 def test_held_out_marks_are_others() -> None:
