@@ -64,6 +64,9 @@ GENTLE = 2.0
 """Force on the tissue that costs nothing, N."""
 TURN = np.radians(8.0)
 """Angle by which the oracle turns the needle at a time."""
+CALM, ENTERED, GENEROUS = 0.1, np.radians(15.0), 0.002
+"""Time for which it waits between turns, s, up to this angle from the entry, where the tolerance is smaller than that,
+m: an arm that goes on from turn to turn is 0.3 mm off."""
 
 
 class DriveLevel(NamedTuple):
@@ -493,7 +496,10 @@ class Task(Base):
         )
         most = float(self.sweep.max()) + self.beyond
         angles = np.arange(-BEFORE, most, TURN)
-        drives = [Step(partial(turn, angle=float(angle)), pace=0.4) for angle in angles[1:]]
+        calm = CALM * (self.level.tolerance < GENEROUS)
+        drives = [
+            Step(partial(turn, angle=float(angle)), wait=calm * (angle < ENTERED), pace=0.4) for angle in angles[1:]
+        ]
         return (
             *(picks if self.level.picks else (Step(lambda seen: {agent: Wish()}, wait=0.2),)),
             Step(lambda seen: turn(seen, -BEFORE), wait=0.2, pace=0.5),
