@@ -62,7 +62,6 @@ class _Adapted:
             raise ValueError(_unsaid(name, "what its actions are", "actions", adapter.actions, FORMS))
         self._signals = Signals(env, adapter.actions, self._stride)
         self._rows = RowActions(env, self._signals)
-        self._observer = _Observer(name, adapter, env, self._signals)
         known = self._signals.action_names
         if adapter.names is not None and tuple(adapter.names) != known:
             raise ValueError(
@@ -72,6 +71,7 @@ class _Adapted:
         for key in ("horizon", "history"):
             if not isinstance(count := getattr(adapter, key), int) or count < 1:
                 raise ValueError(f"{name}: {key} must be a whole number of 1 or more, not {shown(count)}")
+        self._observer = _Observer(name, adapter, env, self._signals)
         many = env.num_envs
         self._chunk = np.zeros((many, adapter.horizon, len(known)), np.float32)
         self._used = np.full(many, adapter.horizon)

@@ -7,7 +7,9 @@ wrote it; otherwise they are said: `lerobot:outputs/train/act,rate=25,actions=jo
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Mapping
+from contextlib import redirect_stdout
 from pathlib import Path
 from typing import Any
 
@@ -43,10 +45,11 @@ class LeRobotPolicy(PolicyAdapter):
         config.device = "cuda" if has_cuda() else "cpu"
         if getattr(config, "temporal_ensemble_coeff", None) is not None:
             raise ValueError("temporal_ensemble_coeff must be null in its config.json: chunks are executed whole")
-        self._policy = get_policy_class(config.type).from_pretrained(folder, config=config)
-        self._before, self._after = make_pre_post_processors(
-            config, str(folder), preprocessor_overrides={"device_processor": {"device": config.device}}
-        )
+        with redirect_stdout(sys.stderr):  # it prints, and results of commands go to stdout
+            self._policy = get_policy_class(config.type).from_pretrained(folder, config=config)
+            self._before, self._after = make_pre_post_processors(
+                config, str(folder), preprocessor_overrides={"device_processor": {"device": config.device}}
+            )
         self.history, self.horizon = getattr(config, "n_obs_steps", 1), getattr(config, "n_action_steps", 1)
         self.observes = {name: _shape(name, own.shape) for name, own in config.input_features.items()} | {TASK: ()}
 
@@ -55,10 +58,11 @@ class LeRobotPolicy(PolicyAdapter):
         import torch
 
         self._policy.reset()
-        rows = {}
+        rows: dict[str, Any] = {}
         with torch.inference_mode():
             for row in range(self.history):
                 rows = self._before({key: _tensor(key, values, row) for key, values in batch.items()})
+                rows.pop("action", None)  # there is none yet
                 self._remember(rows)
             chunk = self._policy.predict_action_chunk(rows)[:, : self.horizon]
             actions = self._after(chunk.flatten(0, 1)).reshape(chunk.shape)
