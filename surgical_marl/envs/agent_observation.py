@@ -31,6 +31,7 @@ class AgentObservation:
         names: terms of the vector that the agent observes.
         pictures: its pictures, by name.
         stated: terms of this agent in the state for critics: what is chosen of its own, and all that the task shows it.
+        slices, stated_slices: where each of the `names`, and of the `stated` terms, is in their vector.
         scales: how the vector of the terms is scaled (False) and that of the `stated` ones (True), if they are.
 
     Raises:
@@ -57,6 +58,7 @@ class AgentObservation:
         if not self.names:
             raise ValueError(f"observe: {agent!r} needs a term that is a vector, such as qpos, besides its pictures")
         self.slices: dict[str, slice] = slices(terms, self.names)
+        self.stated_slices: dict[str, slice] = slices(terms, self.stated)
 
         self._limits = {False: _limits(terms, self.names), True: _limits(terms, self.stated)}
         self.scales = {stated: Scale(*limits) for stated, limits in self._limits.items()}

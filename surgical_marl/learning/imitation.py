@@ -5,9 +5,10 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping
 from contextlib import nullcontext
-from typing import Any
+from typing import Any, Protocol, cast
 
 import torch
+from tensordict import TensorDict
 from torch import Tensor, nn
 
 from surgical_marl.learning.cuda_graph import GraphedFunction
@@ -24,6 +25,13 @@ CHUNK = 1 << 16
 """Pairs that it is computed for at a time."""
 EVERY = 100
 """Steps between two figures of the progress bar: a GPU waits where one is read."""
+
+
+class Pairs(Protocol):
+    """Observations and actions that are imitated: of `Demonstrations`, or of `surgical_marl.learning.recorded`."""
+
+    shown: TensorDict
+    actions: Tensor
 
 
 class Imitation:
@@ -46,7 +54,12 @@ class Imitation:
     """
 
     def __init__(
-        self, actor: MultiAgentActor, demonstrations: Demonstrations, steps: int, batch_size: int, rounds: int = 0
+        self,
+        actor: MultiAgentActor,
+        demonstrations: Pairs,
+        steps: int,
+        batch_size: int,
+        rounds: int = 0,
     ) -> None:
         self.steps, self.done, self.seconds = steps, 0, 0.0
         self._actor, self._demonstrations = actor, demonstrations
@@ -118,7 +131,7 @@ class Imitation:
             return
         self._graph.release()
         while self._asked < due:
-            self._demonstrations.ask(self._actor)
+            cast(Demonstrations, self._demonstrations).ask(self._actor)  # a data set is imitated without rounds
             self._asked += 1
         shown, actions = self._demonstrations.shown, self._demonstrations.actions
         with torch.no_grad():
@@ -162,7 +175,7 @@ class ImitationLoss:
         weight: of the loss.
     """
 
-    def __init__(self, actor: MultiAgentActor, demonstrations: Demonstrations, batch_size: int, weight: float) -> None:
+    def __init__(self, actor: MultiAgentActor, demonstrations: Pairs, batch_size: int, weight: float) -> None:
         self._widths = [actor.counts[group] * width for group, width in actor.outputs.items()]
         self._groups = list(actor.outputs)
         self._demonstrations, self._batch_size, self._weight = demonstrations, batch_size, weight

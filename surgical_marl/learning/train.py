@@ -27,6 +27,7 @@ from surgical_marl.learning.demonstrations import check_demonstrations
 from surgical_marl.learning.faults import Diverged, Fault
 from surgical_marl.learning.log import Log, Reports
 from surgical_marl.learning.memory import check_room, in_memory
+from surgical_marl.learning.recorded import check_recorded
 from surgical_marl.learning.trainer import OWN, Trainer
 from surgical_marl.plugins.task_file import label
 from surgical_marl.plugins.tasks import TASKS
@@ -74,6 +75,8 @@ def make_training(settings: Settings) -> Trainer:
     check_reach(settings)
     if settings.shown_by_oracle:
         check_demonstrations(settings)
+    if settings.imitates and settings.imitation.data:
+        check_recorded(settings)
     with distributed.in_turn():
         env = make_env(settings)
     check_room(settings, env)

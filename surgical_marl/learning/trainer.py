@@ -17,6 +17,7 @@ from surgical_marl.learning.demonstrations import Demonstrations
 from surgical_marl.learning.episodes import Episodes
 from surgical_marl.learning.faults import Fault
 from surgical_marl.learning.imitation import RATE, Imitation, ImitationLoss
+from surgical_marl.learning.recorded import Recorded
 from surgical_marl.learning.reporter import Report, Reporter, mark
 from surgical_marl.plugins.algorithms import ALGORITHMS
 from surgical_marl.policies.networks import MultiAgentActor, actor_config, network_config
@@ -78,8 +79,10 @@ class Trainer:
         self._demonstrations = Demonstrations(settings, self.env.layout, device) if shown else None
         self.algorithm.imitates = imitation.steps > 0
         self._imitation: Imitation | None = None
-        if self._demonstrations is not None:
-            pairs = self.algorithm.actor, self._demonstrations
+        if settings.imitates:
+            recorded = Recorded(settings, self.env.layout, env, device) if imitation.data else self._demonstrations
+            assert recorded is not None
+            pairs = self.algorithm.actor, recorded
             if imitation.steps > 0:
                 self._imitation = Imitation(*pairs, imitation.steps, imitation.batch_size, imitation.rounds)
             if imitation.weight > 0:

@@ -56,6 +56,7 @@ class Signals:
         state_names: of the numbers of a state, such as "psm_0/yaw".
         action_names: likewise.
         arms: of the agents, in their order.
+        form, stride: as given.
 
     Raises:
         ValueError: the form needs position targets and the control has none, it needs single steps and rows stand for
@@ -64,7 +65,7 @@ class Signals:
 
     def __init__(self, env: BatchedEnv, form: str, stride: int = 1) -> None:
         check_form(form, env.control, stride)
-        self.form = form
+        self.form, self.stride = form, stride
         self.arms: dict[str, Arm] = {agent: env.scene.mounts[agent].arm for agent in env.agents}
         self._terms = {agent: env.observation_terms(agent) for agent in env.agents}
         for agent, terms in self._terms.items():

@@ -18,6 +18,7 @@ from surgical_marl.plugins.tasks import TASKS
 from surgical_marl.runs.content import found_scene
 from surgical_marl.runtime import has_cuda
 from surgical_marl.tasks.base.options import Options
+from surgical_marl.untrusted.files import user_path
 from surgical_marl.untrusted.schema import Checked, Place, as_mapping, check, choice, fields_of, number
 from surgical_marl.untrusted.values import shown
 from surgical_marl.yaml_file import dump_yaml, load_yaml, parse_yaml
@@ -86,19 +87,26 @@ class OracleStatesSettings(Checked):
 class ImitationSettings(Checked):
     """Imitation of the oracle's actions, before the first iteration and beside learning (see `learning/imitation.py`).
 
-    steps: gradient steps before the first iteration; 0 for none. batch_size: pairs of observation and action in each of
-    them. rounds: how often the oracle is asked in between what it would do in episodes that the actor plays. hold:
-    iterations in which only the critic learns then, because what it says before would spoil what was imitated. weight:
-    of the imitation's loss in the loss of every mini-batch after that.
+    data: the folder of an exported data set that is imitated instead, see `learning/recorded.py`; "" for none. steps:
+    gradient steps before the first iteration; 0 for none. batch_size: pairs of observation and action in each of them.
+    rounds: how often the oracle is asked in between what it would do in episodes that the actor plays. hold: iterations
+    in which only the critic learns then, because what it says before would spoil what was imitated. weight: of the
+    imitation's loss in the loss of every mini-batch after that.
     """
 
     prefix: ClassVar[str] = "imitation."
 
+    data: str = ""
     steps: int = number(0, 0, 1_000_000)
     batch_size: int = number(1024, 1, 1_000_000)
     rounds: int = number(0, 0, 1000)
     hold: int = number(10, 0, 1_000_000)
     weight: float = number(0.0, 0.0, 1000.0)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.data:  # a run goes on from another working folder, too
+            object.__setattr__(self, "data", str(user_path(self.data).absolute()))
 
 
 @dataclass(frozen=True)
@@ -190,7 +198,12 @@ class Settings(Options):
     @property
     def shown_by_oracle(self) -> bool:
         """True if the oracle's episodes have a part in learning: as starts, or to be imitated."""
-        return self.oracle_states.rate > 0 or self.imitation.steps > 0 or self.imitation.weight > 0
+        return self.oracle_states.rate > 0 or (self.imitates and not self.imitation.data)
+
+    @property
+    def imitates(self) -> bool:
+        """True if demonstrations are imitated: the oracle's, or those of a data set."""
+        return self.imitation.steps > 0 or self.imitation.weight > 0
 
     def in_training(self) -> Settings:
         """Return these settings with the episodes of training."""
