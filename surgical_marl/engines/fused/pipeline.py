@@ -84,6 +84,12 @@ def _interleave(program: Program) -> None:
         program.code = interleave(program.code)
 
 
+def _store_in_branches(program: Program) -> None:
+    # short code keeps its results in registers, and is faster if it stores all of them at its end
+    if is_long(large_branches(program.code)):
+        program.code = store_in_branches(program.code)
+
+
 def _code(function: Callable[[Code], Code]) -> Callable[[Program], None]:
     def run(program: Program) -> None:
         program.code = function(program.code)
@@ -102,7 +108,7 @@ PASSES = (
     Pass("load_early", lambda program: load_early(program.graph, program.schedule), "schedule"),
     Pass("store_late", _store_late, "schedule", required=True),
     Pass("lower", _lower, "code", required=True),
-    Pass("store_in_branches", _code(store_in_branches), "code", "cuda"),
+    Pass("store_in_branches", _store_in_branches, "code", "cuda"),
     Pass("roll_stores", _code(roll_stores), "code"),
     Pass("check_finite", _check_finite, "code", required=True),
     Pass("count_work", _code(count_work), "code"),

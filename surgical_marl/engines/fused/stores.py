@@ -102,9 +102,8 @@ def roll_stores(code: ir.Code) -> ir.Code:
     arrays, copied, found = ir.arrays_in_memory(code), _copied(code), ir.Code()
     for rolls, group in groupby(code, lambda one: isinstance(one, ir.Store) or _name(one) in copied):
         block = [*group]
-        stores = [one for one in block if isinstance(one, ir.Store)]
-        found += [one for one in block if not isinstance(one, ir.Store)]
-        found += _rolled(stores, arrays, copied) if rolls else []
+        loops = _rolled([one for one in block if isinstance(one, ir.Store)], arrays, copied) if rolls else []
+        found += [one for one in block if not isinstance(one, ir.Store)] + loops if loops else block
     reads = _reads(found)
     return [one for one in found if _name(one) not in copied or reads[_name(one)]]
 
@@ -123,7 +122,7 @@ def _copied(code: ir.Code) -> dict[str, ir.Call]:
 
 
 def _rolled(stores: list[ir.Store], arrays: set[str], copied: dict[str, ir.Call]) -> ir.Code:
-    """Return stores, by loops where fields, and what is stored there, are evenly spaced."""
+    """Return stores, by loops where fields, and what is stored there, are evenly spaced; nothing if that is nowhere."""
     rows: dict[Any, list[ir.Store]] = {}
     for one in sorted(stores, key=lambda one: one.field):
         rows.setdefault(_row(one, arrays, copied), []).append(one)
@@ -131,7 +130,7 @@ def _rolled(stores: list[ir.Store], arrays: set[str], copied: dict[str, ir.Call]
     for kind, row in rows.items():
         for run in _runs(row, copied):
             found += [_loop(run, copied)] if kind is not None and len(run) >= LEAST_ROW else run
-    return found
+    return found if any(isinstance(one, ir.Repeat) for one in found) else []
 
 
 def _name(one: ir.Instruction) -> str:
