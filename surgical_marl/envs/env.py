@@ -327,7 +327,7 @@ class Env:
         start = task.start(own)
         hidden = self.plant.start(jax.random.fold_in(own, HIDDEN), start.qpos)
         poses = self.plant.place(jax.random.fold_in(own, PLACES), start.poses)
-        physics = self.plant.at_rest(hidden, start.qpos, poses)
+        physics = self.plant.at_rest(hidden, start.qpos, poses, start.threads)
         contacts, arms = self.simulator.home_contacts, self.simulator.home_views
         if start.qpos is not None:
             contacts, arms = self.simulator.look(physics)

@@ -144,7 +144,11 @@ class Plant:
         }
 
     def at_rest(
-        self, hidden: Hidden | None, qpos: Array | None = None, poses: Mapping[str, Pose] | None = None
+        self,
+        hidden: Hidden | None,
+        qpos: Array | None = None,
+        poses: Mapping[str, Pose] | None = None,
+        threads: Mapping[str, Array] | None = None,
     ) -> Physics:
         """Return arms and objects at rest.
 
@@ -152,9 +156,10 @@ class Plant:
             hidden: what was drawn for the episode.
             qpos: joint positions [nq] of the whole scene; None for home.
             poses: of free objects by name. The others are where the scene places them.
+            threads: places of the nodes of loose threads by name, m, [n, 3]. Others lie as the scene says.
         """
         simulator = self.actual(hidden)
-        physics = simulator.at(jnp.asarray(simulator.scene.home, jnp.float32) if qpos is None else qpos, poses)
+        physics = simulator.at(jnp.asarray(simulator.scene.home, jnp.float32) if qpos is None else qpos, poses, threads)
         return physics if hidden is None else physics.with_arms(ctrl=hidden.motor)
 
     def command(

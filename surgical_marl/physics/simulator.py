@@ -49,26 +49,33 @@ class Simulator:
         """Return all arms at home, at rest."""
         return self.at(jnp.asarray(self.scene.home, jnp.float32))
 
-    def at(self, qpos: Array, poses: Mapping[str, Pose] | None = None) -> Physics:
+    def at(
+        self, qpos: Array, poses: Mapping[str, Pose] | None = None, threads: Mapping[str, Array] | None = None
+    ) -> Physics:
         """Return arms and objects at rest.
 
         Args:
             qpos: joint positions [nq] of the scene; the commands keep them there.
             poses: of free objects by name. The others are where the scene places them.
+            threads: places of the nodes of loose threads by name, m, [n, 3]. Others lie as the scene says.
 
         Raises:
-            ValueError: a name that is not that of a free object.
+            ValueError: a name that is not that of a free object, or of a loose thread.
         """
-        for name in poses or {}:
-            if name not in self.scene.free_objects:
-                raise unknown(f"free object of scene {self.scene.name!r}", name, list(self.scene.free_objects))
+        for kind, given, known in (
+            ("free object", poses, self.scene.free_objects),
+            ("thread", threads, self.step.systems),
+        ):
+            for name in given or {}:
+                if name not in known:
+                    raise unknown(f"{kind} of scene {self.scene.name!r}", name, list(known))
         states: dict[str, Any] = {ARMS: self.step.arms.start(qpos, self._holding(qpos))}
         if self.step.bodies:
             states[RIGID_BODIES] = self.step.bodies.start(poses or {})
             if self.step.attachments:
                 poses = self.step.arms.dynamics.pose(qpos)
                 states[ATTACHMENTS] = self.step.attachments.start(poses, states[RIGID_BODIES].bodies)
-        return Physics(states | self.step.start_systems(states.get(RIGID_BODIES)))
+        return Physics(states | self.step.start_systems(states.get(RIGID_BODIES), threads or {}))
 
     def _holding(self, qpos: Any) -> Any:
         """Return the commands [nu] that keep the arms where they are."""

@@ -13,6 +13,7 @@ solved alone.
 from __future__ import annotations
 
 import copy
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import jax
@@ -231,12 +232,18 @@ class Step:
 
     # -- other systems
 
-    def start_systems(self, bodies: RigidBodyState | None) -> dict[str, Any]:
-        """Return the states of all systems at the beginning of an episode, by name."""
-        return {
+    def start_systems(self, bodies: RigidBodyState | None, threads: Mapping[str, Array]) -> dict[str, Any]:
+        """Return the states of all systems at the beginning of an episode, by name.
+
+        Args:
+            bodies: the free objects; None in a scene of arms alone.
+            threads: places of the nodes of threads that do not begin where the scene says, m, [n, 3].
+        """
+        found = {
             name: system.start(self._couplings[name].tied(bodies.bodies))
             for name, system in self.systems.items() if bodies
         }  # fmt: skip
+        return found | {name: self.systems[name].laid(found[name], places) for name, places in threads.items()}
 
     def _meetings(self, physics: Physics, found: Found) -> dict[str, Meeting]:
         """Return the contacts of all systems, and their answers.

@@ -43,13 +43,13 @@ from surgical_marl.tasks.base.oracle_script import EARLY, Snapshot, Step, Wish
 from surgical_marl.tasks.base.task import PRECISION, Start
 from surgical_marl.tasks.base.task import Task as BaseTask
 from surgical_marl.tasks.base.terms import STRONGEST, Picture, Term
-from surgical_marl.tasks.base.workspace import CLEARANCE, choose
+from surgical_marl.tasks.base.workspace import CLEARANCE, SHIFTED, TURNED, about_home, choose
 
 if TYPE_CHECKING:
     from jax import Array
 
     from surgical_marl.physics.systems.tissue import Tissue
-    from surgical_marl.scenes.scene import Mount, Scene
+    from surgical_marl.scenes.scene import Scene
     from surgical_marl.tasks.base.options import Options
     from surgical_marl.tasks.base.world import World
 
@@ -75,8 +75,6 @@ WRIST = 0.0102
 BESIDE = 0.010
 """Distance from the lesion along the edge at which the flap is pinched, towards the second arm, m: the tool of that
 one leans to its own side, over this part of the flap."""
-TURNED, SHIFTED = 0.1, 0.01
-"""Largest distance of a joint that turns, rad, or slides, m, from home at the start at `default`; a jaw has none."""
 SAG = 0.0065
 """Distance by which the edge hangs below where it is without weight, m: to find out what arms can reach."""
 LEAN, DEEP, BEFORE = np.radians(55.0), 0.003, 0.012
@@ -444,18 +442,12 @@ class Task(BaseTask):
                 good &= reached
             q, reached = joints_at(second, self._touching(points, WAITS))
             good &= reached & joints_at(second, self._touching(points, TOP), q)[1]
-            starts = {agent: self._posture(rng, mount) for agent, mount in scene.mounts.items()}
+            starts = {agent: about_home(rng, mount.arm, self.level.off, ROWS) for agent, mount in scene.mounts.items()}
             good &= scene.clearance(starts) > CLEARANCE
             rows = np.concatenate([points, grips[:, None], scene.full_qpos(starts)], -1)
             return rows[good], np.zeros(good.sum(), bool)
 
         return choose(scene, batch, ROWS, 0.0)
-
-    def _posture(self, rng: np.random.Generator, mount: Mount) -> np.ndarray:
-        """Return joint positions [ROWS, n] at the start."""
-        arm = mount.arm
-        off = np.where([joint.slides for joint in arm.actuated], SHIFTED, TURNED) * ~arm.moves_jaw
-        return np.asarray(arm.home + self.level.off * off * rng.uniform(-1.0, 1.0, (ROWS, len(off))))
 
 
 class Flap:

@@ -263,6 +263,13 @@ class System(ABC):
     def start(self, places: Array) -> Any:
         """Return the state at the beginning of an episode, with its ties fastened at these places, m, [t, 3]."""
 
+    def laid(self, state: Any, places: Array) -> Any:
+        """Return the state at the beginning of an episode with its nodes at these places, m, [n, 3].
+
+        ValueError where it can't begin elsewhere than the scene says.
+        """
+        raise ValueError(f"only loose threads can be laid elsewhere than the scene says, not a {type(self).__name__}")
+
     @abstractmethod
     def shapes(self, state: Any) -> Shapes:
         """Return the capsules that others can touch."""

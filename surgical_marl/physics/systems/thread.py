@@ -183,6 +183,12 @@ class Thread(Soft):
             chain, none(self.contacts), none(self.crossings), holds, jnp.bool_(False), jnp.zeros((self.nodes - 1, 3))
         )  # fmt: skip
 
+    def laid(self, state: ThreadState, places: Array) -> ThreadState:
+        """Return the thread with its nodes elsewhere, as far apart as edges are long; ValueError if it is tied."""
+        if self.ties:
+            raise ValueError("only loose threads can be laid elsewhere than the scene says, not one that is tied")
+        return state._replace(chain=state.chain._replace(position=places))
+
     def shapes(self, state: ThreadState) -> Shapes:
         position = state.chain.position
         speed = jnp.sqrt(jnp.sum(state.chain.velocity * state.chain.velocity, -1))

@@ -50,6 +50,9 @@ class Start(NamedTuple):
     """Joint positions of the whole scene, [nq]; None if every episode starts at home."""
     poses: Mapping[str, Pose] = {}
     """Poses of free objects at rest, by name, without overlaps. Others begin where the scene places them."""
+    threads: Mapping[str, Array] = {}
+    """Places of the nodes of loose threads, by name, m, [n, 3], as far apart as edges are long. Others lie as the scene
+    says."""
 
 
 class Level(NamedTuple):

@@ -31,6 +31,17 @@ MOST_BATCHES = 8
 """Greatest number of batches that are drawn in search of targets that cross."""
 TOLERANCE = 1e-4
 """A target is reached when inverse kinematics comes this close, m."""
+TURNED, SHIFTED = 0.1, 0.01
+"""Distance of a joint that turns, rad, or slides, m, from home that is one unit of `about_home`."""
+
+
+def about_home(rng: np.random.Generator, arm: Arm, off: float, rows: int) -> np.ndarray:
+    """Return joint positions [rows, n] of an arm at most `off` units from home, of `TURNED` and `SHIFTED`, at random.
+
+    The jaw stays at home.
+    """
+    furthest = np.where([joint.slides for joint in arm.actuated], SHIFTED, TURNED) * ~arm.moves_jaw
+    return np.asarray(arm.home + off * furthest * rng.uniform(-1.0, 1.0, (rows, len(furthest))))
 
 
 def target_table(scene: Scene, spread: float, crossing: float = 0.0, seed: int = 0) -> np.ndarray:
