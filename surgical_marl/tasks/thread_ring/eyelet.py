@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from surgical_marl.plugins.task_file import label
-from surgical_marl.runtime import jnp
+from surgical_marl.runtime import jax, jnp
 
 if TYPE_CHECKING:
     from jax import Array
@@ -21,6 +21,8 @@ if TYPE_CHECKING:
 
 EYE = "eye"
 """The site in the middle of an eyelet's hole, whose z axis is that of the hole."""
+BETWEEN = np.array([[-0.0024, -0.0006, -0.0090], [0.0024, 0.0006, 0.0004]], np.float32)
+"""Box in a tool's frame in which a place of the thread is between the plates of a closed jaw, m."""
 
 
 class Eyelet:
@@ -66,6 +68,8 @@ class Eyelet:
         """Length of an edge of the thread, m."""
         self.path: np.ndarray = np.array(system.path, float)
         """Places of its nodes in the scene, m, [n, 3]."""
+        self.behind: np.ndarray = self.edge * np.arange(len(self.path) - 1, -1, -1, dtype=np.float32)
+        """Lengths between its nodes and its end, m, [n]."""
 
     def through(self, nodes: Any) -> tuple[Array, Array]:
         """Return how often a thread winds through the hole, and the length of its end that is past it.
@@ -77,18 +81,42 @@ class Eyelet:
             Crossings of the hole's disc towards the second arm's side, less those back, [] int32; and the length from
             the last crossing to the thread's end, m, [], 0 where there is none.
         """
-        off = nodes - self.centre.astype(np.float32)
-        along = off @ self.axis.astype(np.float32)
-        before, after = along[:-1], along[1:]
-        onward, backward = (before <= 0) & (after > 0), (before > 0) & (after <= 0)
-        share = jnp.clip(before / jnp.where(onward | backward, before - after, 1.0), 0.0, 1.0)
-        at = off[:-1] + share[:, None] * (off[1:] - off[:-1])
-        inside = jnp.sum(at * at, -1) < np.float32(self.radius**2)
-        left = (np.arange(len(self.path) - 1, 0, -1, dtype=np.float32) - share) * np.float32(self.edge)
-        crossed = inside & (onward | backward)
-        turns = jnp.sum(jnp.where(crossed, jnp.where(onward, 1, -1), 0))
-        length = jnp.min(jnp.where(crossed, left, np.float32(self.edge * len(self.path))))
-        return turns, jnp.where(crossed.any(), length, 0.0)
+        centre, axis = self.centre.astype(np.float32), self.axis.astype(np.float32)
+
+        def cross(found: tuple[Array, Array], edge: tuple[Any, Array, Array]) -> tuple[tuple[Array, Array], None]:
+            (turns, length), (behind, start, end) = found, edge
+            off, way = start - centre, end - start
+            before, after = off @ axis, (end - centre) @ axis
+            crosses = (before <= 0) != (after <= 0)
+            share = before / jnp.where(crosses, before - after, 1.0)
+            at = off + share * way
+            crosses &= at @ at < np.float32(self.radius**2)
+            turns += jnp.where(crosses, jnp.where(after > 0, 1, -1), 0)
+            return (turns, jnp.where(crosses, behind - share * np.float32(self.edge), length)), None
+
+        none = jnp.int32(0), jnp.float32(0.0)
+        found: tuple[Array, Array] = jax.lax.scan(cross, none, (self.behind[:-1], nodes[:-1], nodes[1:]))[0]
+        return found
+
+    def pinched(self, nodes: Any, tip: Array, axes: Array) -> Array:
+        """Return how far behind its end the foremost place of a thread is that a closed jaw holds, m, []; -1 for none.
+
+        Args:
+            nodes: of the thread in the world, m, [n, 3].
+            tip: place of the tool tip in the world, m, [3].
+            axes: of the tool's frame, columns, [3, 3].
+        """
+
+        def look(found: Array, edge: tuple[Any, Array, Array]) -> tuple[Array, None]:
+            behind, start, end = edge
+            for share in (0.0, 0.5):
+                own = (start + np.float32(share) * (end - start) - tip) @ axes
+                held = ((own > BETWEEN[0]) & (own < BETWEEN[1])).all()
+                found = jnp.where(held, behind - np.float32(share * self.edge), found)
+            return found, None
+
+        found: Array = jax.lax.scan(look, jnp.float32(-1.0), (self.behind[:-1], nodes[:-1], nodes[1:]))[0]
+        return found
 
     def place(self, nodes: Any, behind: float) -> Any:
         """Return the place on a thread that is a length behind its end, m, [3], from its nodes [n, 3]."""

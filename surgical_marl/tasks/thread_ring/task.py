@@ -61,8 +61,6 @@ READY = 0.008
 """Length through the hole from which the second arm may take the thread, m."""
 LENGTHS = 0.025, 0.040
 """Least and greatest length that should be through the hole in the end, m."""
-BETWEEN = np.array([[-0.0024, -0.0006, -0.0090], [0.0024, 0.0006, 0.0004]])
-"""Box in a tool's frame in which a place of the thread is between the plates of a closed jaw, m."""
 CLOSED = 0.06
 """Angle of a jaw beyond that at which it is empty, up to which it is closed, rad: the thread holds it open by less."""
 LOST = 0.020
@@ -212,12 +210,12 @@ class Task(BaseTask):
         least = {}
         for agent, behind in ((self.first, GRIPS[0]), (self.second, GRIPS[1])):
             least[agent] = known(_length(eyelet.place(nodes, behind) - self._tool(world, agent)[0]))
-        every, past = self._pinched(world, self.first, nodes), self._pinched(world, self.second, nodes)
+        past = self._pinched(world, self.second, nodes)
         return Now(
             least[self.first],
             least[self.second],
-            every.any(),
-            (past & (self._behind < length)).any(),
+            self._pinched(world, self.first, nodes) >= 0,
+            (past >= 0) & (past < length),
             threaded,
             length,
             known(OUT + jnp.where(threaded, -jnp.minimum(length, OUT), away)),
@@ -226,23 +224,13 @@ class Task(BaseTask):
             jnp.max(view.tension),
         )
 
-    @property
-    def _behind(self) -> np.ndarray:
-        """Lengths between the thread's end and its nodes and the middles of its edges, m, [2 n - 1]."""
-        count = 2 * len(self.eyelet.path) - 1
-        return np.arange(count - 1, -1, -1, dtype=np.float32) * np.float32(self.eyelet.edge / 2)
-
     def _pinched(self, world: World, agent: str, nodes: Array) -> Array:
-        """Return which nodes and middles of edges are between the plates of an arm's closed jaw, [2 n - 1] bool."""
-        tip, axes = self._tool(world, agent)
-        middles = jnp.concatenate([(nodes[:-1] + nodes[1:]) / 2, nodes[-1:]])
-        places = jnp.stack([nodes, middles], 1).reshape(-1, 3)[:-1]
-        own = (places - tip) @ axes
+        """Return how far behind its end the foremost place is that an arm's jaw holds, m, []; -1 for none."""
         arm = self.scene.mounts[agent].arm
         assert arm.jaw
         angle = world.arms[agent].qpos[int(np.flatnonzero(arm.moves_jaw)[0])]
-        closed = angle < np.float32(arm.jaw.closed + CLOSED)
-        return ((own > _f32(BETWEEN[0])) & (own < _f32(BETWEEN[1]))).all(-1) & closed
+        held = self.eyelet.pinched(nodes, *self._tool(world, agent))
+        return jnp.where(angle < np.float32(arm.jaw.closed + CLOSED), held, -1.0)
 
     def _tool(self, world: World, agent: str) -> tuple[Any, Any]:
         """Return the place, m, [3], and the axes, [3, 3], of an arm's tool tip in the world."""
@@ -368,10 +356,7 @@ class Task(BaseTask):
         def to_eyelet(world: World) -> Array:
             return (_f32(eyelet.centre) - nodes(world)[-1]) @ turn
 
-        def holds(world: World, *agents: str) -> Array:
-            return as_float(self._holding(self.now(world), *agents))[None]
-
-        others = [other for other in self.scene.agents if other != agent]
+        own = np.array([agent == one for one in (self.first, self.second)], np.float32)
 
         reach, one = mount.arm.reach, np.ones(1)
         ways, low, high = reach.minus(reach), np.tile(reach.low, len(MARKS)), np.tile(reach.high, len(MARKS))
@@ -381,10 +366,14 @@ class Task(BaseTask):
             f"{name}_marks": Term(marks, low, high, "object"),
             "to_grip": Term(to_grip, *ways, "object"),
             "to_eyelet": Term(to_eyelet, *ways, "object"),
-            "holds": Term(lambda world: holds(world, agent), 0 * one, one, "arm"),
-            "others_hold": Term(lambda world: holds(world, *others), 0 * one, one, "others"),
-            "tension": Term(lambda world: self.now(world).tension[None], 0 * one, STRONGEST * one, "object"),
-            "through": Term(lambda world: self.now(world).length[None], 0 * one, whole, "object"),
+            "holds": Term(lambda world: (world.goal.held @ own)[None], 0 * one, one, "arm"),
+            "others_hold": Term(
+                lambda world: jnp.minimum(world.goal.held @ (1 - own), 1.0)[None], 0 * one, one, "others"
+            ),
+            "tension": Term(
+                lambda world: jnp.max(world.systems[name].tension)[None], 0 * one, STRONGEST * one, "object"
+            ),
+            "through": Term(lambda world: world.goal.length[None], 0 * one, whole, "object"),
             "length": Term(
                 lambda world: self.tables["lengths"][world.goal.row][None], 0 * one, LENGTHS[1] * one, "team_goal"
             ),
