@@ -1,7 +1,7 @@
 """Threading an eyelet: an arm brings the end of a thread through it, and another one takes it there and pulls.
 
-Both hold the thread by friction alone. A closed jaw does not fit through the hole, so the thread changes hands there. An
-arm alone could let go and take the thread again on the other side: the task asks for both.
+Both hold the thread by friction alone. A closed jaw does not fit through the hole, so the thread changes hands there.
+An arm alone could let go and take the thread again on the other side: the task asks for both.
 
 Agents        the two arms of the scene. The first one with a jaw brings the thread, the second such one takes it.
 Observation   joint positions and velocities, tool tip, position targets, contact force; of the thread six places, from
@@ -18,9 +18,9 @@ Reward        the same for all arms, but for `clearance` and `collision`; weight
               through towards what it should be (40 / m). Of each step: `precision`, while the second arm alone holds,
               1 at that length and a third at 5 mm off (0.1); `success` (0.5); `overload`, more than 9.4 N in the thread
               (-0.1), `drop` (-2), `collision` (-2), `clearance` (0).
-Success       the first arm held the thread as 8 mm of it were through; now it goes through the hole once, from the first
-              arm's side, the second arm holds it past the hole, the first does not, and the length past the hole is
-              within the tolerance of what it should be. The thread has not been pulled with more than 9.4 N, the
+Success       the first arm held the thread as 8 mm of it were through; now it goes through the hole once, from the
+              first arm's side, the second arm holds it past the hole, the first does not, and the length past the hole
+              is within the tolerance of what it should be. The thread has not been pulled with more than 9.4 N, the
               knot-pull strength of USP 3-0.
 Termination   when the thread's end has fallen by 20 mm; an episode is truncated after 250 control steps (5 s).
 Randomisation the thread is shifted and turned about its end, joints begin off their home, and the length is from 25 to
