@@ -64,9 +64,9 @@ GENTLE = 2.0
 """Force on the tissue that costs nothing, N."""
 TURN = np.radians(8.0)
 """Angle by which the oracle turns the needle at a time."""
-CALM, ENTERED, GENEROUS = 0.1, np.radians(15.0), 0.002
-"""Time for which it waits between turns, s, up to this angle from the entry, where the tolerance is smaller than that,
-m: an arm that goes on from turn to turn is 0.3 mm off."""
+GENEROUS, CALM, PRESSED = 0.002, 0.1, 0.0015
+"""Where the tolerance is smaller than the first, m, the oracle waits for so long before each turn up to the entry, s,
+and presses the tip straight down by the last, m."""
 
 
 class DriveLevel(NamedTuple):
@@ -472,12 +472,12 @@ class Task(Base):
         """Return how the arm does it: to the entry along the needle's arc, then on along it."""
         agent, needle = self.driver, self.needle
 
-        def turn(seen: Snapshot, angle: float | None) -> dict[str, Wish]:
+        def turn(seen: Snapshot, angle: float | None, lower: float = 0.0) -> dict[str, Wish]:
             row = seen.goal.row
             angles = self.sweep[row] + self.beyond
             angles = angles if angle is None else np.minimum(angle, angles)
             held = np.linalg.inv(seen.objects[self.object]) @ seen.tools[agent]
-            return {agent: Wish(driven(needle, self.entries[row], angles) @ held)}
+            return {agent: Wish(moved(driven(needle, self.entries[row], angles) @ held, [0.0, 0.0, -lower]))}
 
         def grip(seen: Snapshot, beyond: float) -> dict[str, Wish]:
             tool = seen.objects[self.object] @ self.held[seen.goal.row]
@@ -496,10 +496,11 @@ class Task(Base):
         )
         most = float(self.sweep.max()) + self.beyond
         angles = np.arange(-BEFORE, most, TURN)
-        calm = CALM * (self.level.tolerance < GENEROUS)
-        drives = [
-            Step(partial(turn, angle=float(angle)), wait=calm * (angle < ENTERED), pace=0.4) for angle in angles[1:]
-        ]
+        drives = [Step(partial(turn, angle=float(angle)), pace=0.4) for angle in angles[1:]]
+        if self.level.tolerance < GENEROUS:  # along the arc a tip slides over tissue by up to 1.7 mm before it enters
+            before = [step._replace(wait=CALM) for step, angle in zip(drives, angles[1:], strict=True) if angle < 0]
+            press = Step(partial(turn, angle=0.0, lower=PRESSED), wait=CALM, pace=0.2)
+            drives = [*before, press, *drives[len(before) :]]
         return (
             *(picks if self.level.picks else (Step(lambda seen: {agent: Wish()}, wait=0.2),)),
             Step(lambda seen: turn(seen, -BEFORE), wait=0.2, pace=0.5),
