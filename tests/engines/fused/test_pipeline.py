@@ -14,6 +14,7 @@ from jax import lax
 
 from surgical_marl.engines.fused import graph, hints, instructions, instrumentation, source_cache, stores
 from surgical_marl.engines.fused import instructions as ir
+from surgical_marl.engines.fused.c_printer import CPrinter
 from surgical_marl.engines.fused.graph import Graph
 from surgical_marl.engines.fused.options import DUMP, PASSES, VERIFY
 from surgical_marl.engines.fused.pipeline import CSE, Program, compile_program, switched_off
@@ -126,6 +127,13 @@ def test_a_reset_is_stored_in_its_branch() -> None:
     loop = "for(int k=0;k<12;++k)STF(outs,0+(1)*k,"
     assert f"{loop}SPLAT(2.0f));" in side and f"{loop}LDF(state,0+(1)*k));" in other and "STF(outs,12," in behind
     check_results(reset, columns, 1e-6)
+
+
+@pytest.mark.parametrize(("rounds", "vector", "few"), [(32, False, True), (31, False, False), (32, True, False)])
+def test_nvrtc_is_told_to_write_out_few_rounds_of_a_long_loop(rounds: int, vector: bool, few: bool) -> None:
+    """A short one stays whole: elements at known places are kept in registers."""
+    loop = ir.Repeat(rounds, ir.Assign(ir.Element("v1", stride=1), ir.Element("v2", stride=1)))
+    assert CPrinter(vector).line(loop).startswith("#pragma unroll 4\nfor(") == few
 
 
 FIELDS = [ir.Define(f"v{k}", "f", ir.Call("load", "f", ("state", k))) for k in range(8)]
