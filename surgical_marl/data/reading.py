@@ -19,7 +19,7 @@ class Table(NamedTuple):
     """The rows of a data set."""
 
     about: dict[str, Any]
-    """How it was made: `rate`, `actions`, `environment` and so on."""
+    """Settings of the export: `rate`, `actions`, `environment` and so on."""
     names: tuple[str, ...]
     """Names of the numbers of an action."""
     columns: dict[str, np.ndarray]

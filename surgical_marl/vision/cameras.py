@@ -24,7 +24,7 @@ CHANNELS = {"": "rgb", "_depth": "depth", "_segmentation": "segmentation"}
 """Ends of the names of pictures, and the channels that they stand for."""
 PICTURES = tuple(view + end for end, view in product(CHANNELS, VIEWS))
 NODES = "nodes/"
-"""How names of nodes of thread and tissue begin."""
+"""First letters of names of nodes of thread and tissue."""
 AT_ONCE = {"cpu": 16, "cuda": 128}
 """Rows that are drawn at once."""
 

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 
 class Grip(NamedTuple):
-    """How the partner's tool grips the needle."""
+    """Pose in which the partner's tool grips the needle."""
 
     lean: float
     """Angle by which it leans outwards, about the wire, rad."""

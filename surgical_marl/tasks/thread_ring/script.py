@@ -1,4 +1,4 @@
-"""How two arms thread an eyelet, on the host: the poses of their tools, the oracle's steps, and what they can reach."""
+"""Threading an eyelet by two arms, on the host: poses of their tools, the oracle's steps, and the reach of both."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ it it comes in, m."""
 AIM = 0.006
 """Distance from the hole at which the end is aligned with its axis, m."""
 ASIDE, WAITS = 0.02, np.array([0.02, 0.0, 0.02])
-"""How far the first tool draws back, and where the second waits, from the hole along its axis, aside, and up, m."""
+"""Way that the first tool draws back, and place of the waiting second, from the hole along its axis, aside, up, m."""
 NEAR = 0.001
 """Error of the length at which the oracle ends, m."""
 
