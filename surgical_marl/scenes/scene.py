@@ -137,6 +137,11 @@ class Scene:
         return {name: place for name, place in self.objects.items() if place.object.free}
 
     @property
+    def holders(self) -> list[str]:
+        """The agents whose jaws have two pads, in order: they can hold things."""
+        return [agent for agent, mount in self.mounts.items() if mount.arm.jaw and len(mount.arm.jaw.pads) == 2]
+
+    @property
     def placements(self) -> dict[str, Placement]:
         """All objects by name, rigid, thread and tissue."""
         return self.objects | self.soft

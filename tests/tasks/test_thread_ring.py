@@ -100,7 +100,7 @@ def test_crossings_are_those_of_places_close_along_the_thread(corners: Any) -> N
 
 
 class Arm(NamedTuple):
-    """What the task reads of an arm."""
+    """Numbers that the task reads of an arm."""
 
     qpos: np.ndarray
     tool_tip: np.ndarray
@@ -110,7 +110,7 @@ class Arm(NamedTuple):
 
 
 class Thread(NamedTuple):
-    """What it reads of a thread."""
+    """Numbers that it reads of a thread."""
 
     position: np.ndarray
     tension: np.ndarray

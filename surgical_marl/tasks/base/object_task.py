@@ -104,7 +104,7 @@ class ObjectTask(Task):
         self.object = find_object(scene, label(options.task), (self.point,), self.scenes or ())
         self.called = self.object
         """Beginning of the names of the observation terms about it."""
-        holders = [agent for agent, mount in scene.mounts.items() if mount.arm.jaw and len(mount.arm.jaw.pads) == 2]
+        holders = scene.holders
         if len(holders) != self.hands:
             raise ValueError(
                 f"{label(options.task)} needs a scene with {self.hands} arm{'s' * (self.hands > 1)} "

@@ -207,10 +207,9 @@ class Task(Base):
 
     def _find_driver(self, scene: Scene, options: Options) -> str:
         """Return the first arm whose jaw has pads; ValueError if there is none."""
-        for agent, mount in scene.mounts.items():
-            if mount.arm.jaw and len(mount.arm.jaw.pads) == 2:
-                return agent
-        raise ValueError(f"{label(options.task)} needs an arm whose jaw has pads; {scene.name!r} has none")
+        if not scene.holders:
+            raise ValueError(f"{label(options.task)} needs an arm whose jaw has pads; {scene.name!r} has none")
+        return scene.holders[0]
 
     @property
     def constants(self) -> tuple[Any, ...]:

@@ -168,7 +168,7 @@ class Task(NeedleDrive):
 
     def _find_partner(self, scene: Scene, options: Options) -> str:
         """Return the second arm whose jaw has pads; ValueError if there is none."""
-        holders = [agent for agent, mount in scene.mounts.items() if mount.arm.jaw and len(mount.arm.jaw.pads) == 2]
+        holders = scene.holders
         if len(holders) < 2:
             raise ValueError(
                 f"{label(options.task)} needs two arms whose jaws have pads; {scene.name!r} has {len(holders)} (choose "

@@ -166,7 +166,7 @@ class Task(BaseTask):
 
     def __init__(self, scene: Scene, options: Options) -> None:
         super().__init__(scene, options)
-        holders = [agent for agent, mount in scene.mounts.items() if mount.arm.jaw and len(mount.arm.jaw.pads) == 2]
+        holders = scene.holders
         if len(holders) != 2:
             raise ValueError(
                 f"{label(options.task)} needs a scene with 2 arms whose jaws have pads; {scene.name!r} has "
